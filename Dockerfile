@@ -1,0 +1,35 @@
+# The needletrack daemon.
+#   docker build --tag needletrack .
+#   docker run --device /dev/video0 --device /dev/video2 --network host --volume "$PWD/config:/config:ro" needletrack run --help
+FROM python:3.11-slim-bookworm AS build
+
+# The pinned packages change seldom and keep a layer of their own.
+WORKDIR /build
+COPY requirements/build.lock requirements/runtime.lock ./
+RUN pip install --no-cache-dir --require-hashes -r build.lock \
+    && python -m venv /opt/needletrack \
+    && /opt/needletrack/bin/pip install --no-cache-dir --require-hashes -r runtime.lock
+
+COPY pyproject.toml README.md LICENSE NOTICE ./
+COPY src ./src
+RUN python -m hatchling build --target wheel --directory dist \
+    && /opt/needletrack/bin/pip install --no-cache-dir --no-deps --no-index dist/*.whl
+
+FROM python:3.11-slim-bookworm
+
+# Members of group video may open /dev/video*.
+RUN useradd --create-home --uid 10001 --groups video needletrack
+COPY --from=build /opt/needletrack /opt/needletrack
+
+# One thread for BLAS and OpenMP: the stages are small, and more threads add jitter instead of speed.
+ENV PATH=/opt/needletrack/bin:$PATH \
+    MPLBACKEND=Agg \
+    OMP_NUM_THREADS=1 \
+    PYTHONUNBUFFERED=1
+
+USER 10001
+WORKDIR /home/needletrack
+# The daemon ends its loop and says goodbye on an interrupt.
+STOPSIGNAL SIGINT
+ENTRYPOINT ["needletrack"]
+CMD ["--help"]

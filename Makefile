@@ -1,0 +1,88 @@
+# Every target makes what it needs by itself: a bare machine has only Python 3.11+, make and a package index.
+# Another interpreter: make env PYTHON=python3.12
+
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+PIP := $(BIN)/python -m pip --disable-pip-version-check
+PACKAGES := $(VENV)/.packages
+INSTALLED := $(VENV)/.installed
+UV_VERSION := 0.13.9
+CODE = $(wildcard src tests tools benchmarks)
+
+.DEFAULT_GOAL := help
+.DELETE_ON_ERROR:
+.PHONY: help env demo test test-slow lint format types bench bench-smoke table1 schema lock clean
+
+help:  ## list the targets
+	@awk -F ':.*## ' '/^[a-z0-9-]+:.*## / { printf "  make %-12s %s\n", $$1, $$2 }' Makefile
+
+env: $(INSTALLED)  ## make the environment .venv from requirements/dev.lock
+
+# Cleared first: a half-finished or older environment leaves nothing behind. The stamp is written last.
+$(PACKAGES): requirements/dev.lock
+	@command -v "$(PYTHON)" >/dev/null || { \
+	  echo "make: there is no '$(PYTHON)': install Python 3.11 or newer, or name it: make env PYTHON=/path/to/python3.12" >&2; exit 1; }
+	@"$(PYTHON)" -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { \
+	  echo "make: '$(PYTHON)' is $$("$(PYTHON)" --version 2>&1 | head -n 1); needletrack needs 3.11 or newer: name one that is installed, e.g. make env PYTHON=python3.12" >&2; exit 1; }
+	@"$(PYTHON)" -c 'import ensurepip, venv' 2>/dev/null || { \
+	  echo "make: '$(PYTHON)' lacks venv or ensurepip: on Debian and Ubuntu, apt-get install python3-venv" >&2; exit 1; }
+	@echo "Installing the pinned packages into $(VENV) (about 200 MB to fetch, once) ..."
+	@"$(PYTHON)" -m venv --clear $(VENV)
+	@$(PIP) install --require-hashes -r requirements/dev.lock >$(VENV)/install.log 2>&1 || { \
+	  tail -n 40 $(VENV)/install.log >&2; echo "make: the packages could not be installed; the whole log: $(VENV)/install.log" >&2; exit 1; }
+	@touch $@
+
+$(INSTALLED): $(PACKAGES) pyproject.toml
+	@$(PIP) install --quiet --no-deps --no-build-isolation --editable .
+	@touch $@
+
+demo: $(INSTALLED)  ## track the bundled recording, watch it arrive over Zenoh, leave pictures in build/demo
+	@$(BIN)/needletrack demo --output build/demo
+
+test: $(INSTALLED)  ## the quick tests, with coverage
+	$(BIN)/python -m pytest -m "not slow" --cov --cov-report=term
+
+test-slow: $(INSTALLED)  ## the tests marked slow
+	@$(BIN)/python -m pytest -m slow || { code=$$?; [ $$code -eq 5 ] && echo "No test is marked slow." || exit $$code; }
+
+lint: $(INSTALLED)  ## ruff and hadolint
+	$(BIN)/ruff check --output-format concise .
+	$(BIN)/ruff format --check .
+	$(BIN)/hadolint Dockerfile
+
+format: $(INSTALLED)  ## let ruff lay out the code and mend what it can
+	$(BIN)/ruff format .
+	$(BIN)/ruff check --fix .
+
+types: $(INSTALLED)  ## mypy --strict
+	$(BIN)/mypy --strict $(CODE)
+
+bench: $(INSTALLED)  ## time per stage and pair, throughput, memory, ratio to the reference method
+	@$(BIN)/python -m benchmarks
+
+bench-smoke: $(INSTALLED)  ## the same on a few pairs: does the benchmark still run?
+	@$(BIN)/python -m benchmarks --smoke
+
+table1: $(INSTALLED)  ## repeat Table 1 of the 2017 paper
+	@$(BIN)/needletrack table1
+
+schema: $(INSTALLED)  ## write the wire's JSON Schema into docs/
+	@$(BIN)/python -m needletrack.publish.schema docs/
+
+# uv lives in an environment of its own, so that the locks can be made while .venv is missing or broken.
+LOCK = build/lock/bin/uv pip compile --quiet --universal --python-version 3.11 --fork-strategy fewest \
+  --generate-hashes --no-emit-index-url --no-emit-find-links --no-header $(UPGRADE)
+lock: build/lock/bin/uv  ## bring the lock files up to pyproject.toml (to the newest of all: make lock UPGRADE=--upgrade)
+	$(LOCK) pyproject.toml --output-file requirements/runtime.lock
+	$(LOCK) --group build -c requirements/runtime.lock --output-file requirements/build.lock
+	$(LOCK) pyproject.toml --group dev -c requirements/runtime.lock -c requirements/build.lock --output-file requirements/dev.lock
+
+build/lock/bin/uv: Makefile
+	@"$(PYTHON)" -m venv --clear build/lock
+	@build/lock/bin/python -m pip --disable-pip-version-check install --quiet uv==$(UV_VERSION)
+	@touch $@
+
+clean:  ## remove the environment and everything generated
+	rm -rf $(VENV) build dist .coverage .mypy_cache .pytest_cache .ruff_cache .hypothesis
+	find src tests tools benchmarks -name __pycache__ -type d -prune -exec rm -rf {} + 2>/dev/null || true

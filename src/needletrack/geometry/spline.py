@@ -1,0 +1,60 @@
+"""Smooth curves in space and in the image: arc length, resampling, tangents, curvature, B-spline bases."""
+
+import numpy as np
+import numpy.typing as npt
+from scipy.interpolate import BSpline
+
+from needletrack.records import Float
+
+DEGREE = 3
+
+
+def arc_length(points: npt.ArrayLike) -> Float:
+    """Length (N,) along a polyline (N, D) from its first point."""
+    steps = np.linalg.norm(np.diff(np.asarray(points, dtype=np.float64), axis=0), axis=1)
+    return np.concatenate([[0.0], np.cumsum(steps)])
+
+
+def resample(points: npt.ArrayLike, count: int) -> Float:
+    """`count` points (count, D), evenly spaced along the polyline (N, D)."""
+    array = np.asarray(points, dtype=np.float64)
+    length = arc_length(array)
+    at = np.linspace(0.0, length[-1], count)
+    return np.column_stack([np.interp(at, length, column) for column in array.T])
+
+
+def unit(vectors: npt.ArrayLike) -> Float:
+    """Vectors (..., D) scaled to length one."""
+    array = np.asarray(vectors, dtype=np.float64)
+    return np.asarray(array / np.linalg.norm(array, axis=-1, keepdims=True))
+
+
+def tangents(points: npt.ArrayLike) -> Float:
+    """Unit tangents (N, D) of a polyline (N, D), by central differences."""
+    return unit(np.gradient(np.asarray(points, dtype=np.float64), axis=0))
+
+
+def clamped_knots(control_points: int) -> Float:
+    """Knot vector (control_points + 4,) of a uniform cubic B-spline on [0, 1] that reaches its end points.
+
+    Raises ValueError below four control points.
+    """
+    if control_points < DEGREE + 1:
+        raise ValueError(f"a cubic spline needs at least {DEGREE + 1} control points, not {control_points}")
+    inner = np.linspace(0.0, 1.0, control_points - DEGREE + 1)
+    return np.concatenate([np.zeros(DEGREE), inner, np.ones(DEGREE)])
+
+
+def basis(at: npt.ArrayLike, control_points: int, derivative: int = 0) -> Float:
+    """Values (N, control_points) of each basis function, or of its derivative, at parameters (N,) in [0, 1].
+
+    A curve is `basis(u, len(c)) @ c` for control points c (M, D): linear in c, so that fits are linear too.
+    """
+    spline = BSpline(clamped_knots(control_points), np.eye(control_points), DEGREE)
+    return np.asarray(spline(np.clip(np.asarray(at, dtype=np.float64), 0.0, 1.0), nu=derivative), dtype=np.float64)
+
+
+def curvature(first: npt.ArrayLike, second: npt.ArrayLike) -> Float:
+    """Curvature (N,) from first and second derivatives (N, 3) with respect to any parameter: |r' x r''| / |r'|^3."""
+    a, b = np.asarray(first, dtype=np.float64), np.asarray(second, dtype=np.float64)
+    return np.asarray(np.linalg.norm(np.cross(a, b), axis=1) / np.linalg.norm(a, axis=1) ** 3)

@@ -1,0 +1,71 @@
+"""Rigid transforms, named `a_from_b` so that neighbours cancel."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial.transform import Rotation
+
+from needletrack.records import Float, frozen_array
+
+# Kalibr prints 12 digits and people round further; 1e-6 is 0.25 micrometres at 250 mm.
+ORTHONORMAL_TOLERANCE = 1e-6
+
+
+@dataclass(frozen=True)
+class RigidTransform:
+    """`a_from_b`: rotation (3, 3) and translation_mm (3,) take points of frame b into frame a.
+
+    Raises ValueError where the rotation is not a proper one, or a number is not finite.
+    """
+
+    rotation: Float
+    translation_mm: Float
+
+    def __post_init__(self) -> None:
+        rotation = frozen_array(self.rotation, (3, 3), "rotation")
+        translation_mm = frozen_array(self.translation_mm, (3,), "translation_mm")
+        if not (np.isfinite(rotation).all() and np.isfinite(translation_mm).all()):
+            raise ValueError("rotation and translation must be finite")
+        error = np.abs(rotation @ rotation.T - np.eye(3)).max()
+        if not error < ORTHONORMAL_TOLERANCE or np.linalg.det(rotation) < 0:
+            raise ValueError(f"not a rotation: R R^T is off from the identity by {error:.2g}, det {np.linalg.det(rotation):.3f}")
+        object.__setattr__(self, "rotation", rotation)
+        object.__setattr__(self, "translation_mm", translation_mm)
+
+    @classmethod
+    def identity(cls) -> "RigidTransform":
+        """The transform of a frame onto itself."""
+        return cls(np.eye(3), np.zeros(3))
+
+    def apply(self, points_mm: npt.ArrayLike) -> Float:
+        """Points (..., 3) of frame b, expressed in frame a."""
+        return np.asarray(points_mm, dtype=np.float64) @ self.rotation.T + self.translation_mm
+
+    def __matmul__(self, other: "RigidTransform") -> "RigidTransform":
+        """`a_from_c = a_from_b @ b_from_c`."""
+        return RigidTransform(self.rotation @ other.rotation, self.apply(other.translation_mm))
+
+    def inverse(self) -> "RigidTransform":
+        """`b_from_a`."""
+        return RigidTransform(self.rotation.T, -self.rotation.T @ self.translation_mm)
+
+
+def orthonormalized(rotation: npt.ArrayLike) -> Float:
+    """The proper rotation (3, 3) nearest to a matrix, in the Frobenius norm (through its SVD)."""
+    u, _, vt = np.linalg.svd(np.asarray(rotation, dtype=np.float64))
+    return u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
+
+
+def orientation_along(direction: npt.ArrayLike) -> Float:
+    """Quaternion xyzw (4,) of the frame whose +z is `direction` and whose +x lies in the plane of +z and the camera's x.
+
+    The roll of a round needle about its axis is not observable; this is the convention that sets it.
+    Where the needle points along the camera's x axis, the camera's y takes its place.
+    """
+    z = np.asarray(direction, dtype=np.float64)
+    z = z / np.linalg.norm(z)
+    reference = np.array([1.0, 0.0, 0.0]) if abs(z[0]) < 0.99 else np.array([0.0, 1.0, 0.0])
+    x = reference - (reference @ z) * z
+    x /= np.linalg.norm(x)
+    return Rotation.from_matrix(np.column_stack([x, np.cross(z, x), z])).as_quat()

@@ -38,7 +38,7 @@ $(INSTALLED): $(PACKAGES) pyproject.toml
 	@touch $@
 
 demo: $(INSTALLED)  ## track the bundled recording, watch it arrive over Zenoh, leave pictures in build/demo
-	@$(BIN)/needletrack demo --output build/demo
+	@$(BIN)/needletrack demo tests/data/recordings/steer-b --output build/demo
 
 test: $(INSTALLED)  ## the quick tests, with coverage
 	$(BIN)/python -m pytest -m "not slow" --cov --cov-report=term
@@ -68,7 +68,7 @@ table1: $(INSTALLED)  ## repeat Table 1 of the 2017 paper
 	@$(BIN)/needletrack table1
 
 schema: $(INSTALLED)  ## write the wire's JSON Schema into docs/
-	@$(BIN)/python -m needletrack.publish.schema docs/
+	@$(BIN)/python -m needletrack.publish.schema docs/wire
 
 # uv lives in an environment of its own, so that the locks can be made while .venv is missing or broken.
 LOCK = build/lock/bin/uv pip compile --quiet --universal --python-version 3.11 --fork-strategy fewest \

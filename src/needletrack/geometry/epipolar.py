@@ -23,7 +23,7 @@ def homogeneous(points: npt.ArrayLike) -> Float:
 
 
 def fundamental_matrix(left_matrix: Float, right_matrix: Float, rotation: Float, translation_mm: Float) -> Float:
-    """F (3, 3) with right^T F left = 0 for undistorted pixels, scaled to unit Frobenius norm (H&Z eq. 9.2; paper eq. 5).
+    """F (3, 3), right^T F left = 0 for undistorted pixels, scaled to unit Frobenius norm (H&Z eq. 9.2; paper eq. 5).
 
     left_matrix, right_matrix (3, 3): camera matrices; rotation (3, 3), translation_mm (3,): right_from_left.
     """
@@ -33,7 +33,7 @@ def fundamental_matrix(left_matrix: Float, right_matrix: Float, rotation: Float,
         @ cross_matrix(rotation.T @ translation_mm)
         @ np.linalg.inv(left_matrix)
     )
-    return f / np.linalg.norm(f)
+    return np.asarray(f / np.linalg.norm(f))
 
 
 def epipoles(left_matrix: Float, right_matrix: Float, rotation: Float, translation_mm: Float) -> tuple[Float, Float]:
@@ -42,12 +42,12 @@ def epipoles(left_matrix: Float, right_matrix: Float, rotation: Float, translati
 
 
 def epipolar_lines(fundamental: Float, points_px: npt.ArrayLike) -> Float:
-    """Lines (N, 3) in the other view of undistorted points (N, 2), with a^2 + b^2 = 1 so that line . point is in pixels.
+    """Lines (N, 3) in the other view of undistorted points (N, 2), a^2 + b^2 = 1 so that line . point is in pixels.
 
     Pass F for points of the left view, F^T for points of the right one (paper eq. 7).
     """
     lines = homogeneous(points_px) @ fundamental.T
-    return lines / np.linalg.norm(lines[:, :2], axis=1, keepdims=True)
+    return np.asarray(lines / np.linalg.norm(lines[:, :2], axis=1, keepdims=True))
 
 
 def epipolar_distance_px(fundamental: Float, left_px: npt.ArrayLike, right_px: npt.ArrayLike) -> Float:

@@ -24,9 +24,9 @@ def resample(points: npt.ArrayLike, count: int) -> Float:
 
 
 def unit(vectors: npt.ArrayLike) -> Float:
-    """Vectors (..., D) scaled to length one."""
+    """Vectors (..., D) scaled to length one; a vector of length zero stays zero."""
     array = np.asarray(vectors, dtype=np.float64)
-    return np.asarray(array / np.linalg.norm(array, axis=-1, keepdims=True))
+    return np.asarray(array / np.maximum(np.linalg.norm(array, axis=-1, keepdims=True), 1e-300))
 
 
 def tangents(points: npt.ArrayLike) -> Float:

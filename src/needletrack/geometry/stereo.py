@@ -53,7 +53,7 @@ class StereoRig:
 
     @cached_property
     def rectification(self) -> tuple[Float, Float, Float]:
-        """Rotations (3, 3) that turn left and right rays so that epipolar lines are rows, and the common focal row scale.
+        """Rotations (3, 3) that turn left and right rays so that epipolar lines are rows, and the common camera matrix.
 
         Returned as (left_rotation, right_rotation, camera_matrix): a rectified pixel is matrix @ rotation @ ray
         (Bouguet's algorithm, cv2.stereoRectify without a shift of the principal point).

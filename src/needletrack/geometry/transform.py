@@ -29,7 +29,9 @@ class RigidTransform:
             raise ValueError("rotation and translation must be finite")
         error = np.abs(rotation @ rotation.T - np.eye(3)).max()
         if not error < ORTHONORMAL_TOLERANCE or np.linalg.det(rotation) < 0:
-            raise ValueError(f"not a rotation: R R^T is off from the identity by {error:.2g}, det {np.linalg.det(rotation):.3f}")
+            raise ValueError(
+                f"not a rotation: R R^T is off from the identity by {error:.2g}, det {np.linalg.det(rotation):.3f}"
+            )
         object.__setattr__(self, "rotation", rotation)
         object.__setattr__(self, "translation_mm", translation_mm)
 
@@ -54,11 +56,11 @@ class RigidTransform:
 def orthonormalized(rotation: npt.ArrayLike) -> Float:
     """The proper rotation (3, 3) nearest to a matrix, in the Frobenius norm (through its SVD)."""
     u, _, vt = np.linalg.svd(np.asarray(rotation, dtype=np.float64))
-    return u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
+    return np.asarray(u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt)
 
 
 def orientation_along(direction: npt.ArrayLike) -> Float:
-    """Quaternion xyzw (4,) of the frame whose +z is `direction` and whose +x lies in the plane of +z and the camera's x.
+    """Quaternion xyzw (4,) of the frame with +z along `direction` and +x in the plane of +z and the camera's x.
 
     The roll of a round needle about its axis is not observable; this is the convention that sets it.
     Where the needle points along the camera's x axis, the camera's y takes its place.
@@ -68,4 +70,4 @@ def orientation_along(direction: npt.ArrayLike) -> Float:
     reference = np.array([1.0, 0.0, 0.0]) if abs(z[0]) < 0.99 else np.array([0.0, 1.0, 0.0])
     x = reference - (reference @ z) * z
     x /= np.linalg.norm(x)
-    return Rotation.from_matrix(np.column_stack([x, np.cross(z, x), z])).as_quat()
+    return np.asarray(Rotation.from_matrix(np.column_stack([x, np.cross(z, x), z])).as_quat())

@@ -1,0 +1,192 @@
+"""From masks of thin structures to ordered lines, followed through crossings and short gaps by their direction."""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+from pydantic import BaseModel, ConfigDict, Field
+from scipy.ndimage import map_coordinates, median_filter, uniform_filter1d
+from skimage.morphology import skeletonize
+
+from needletrack.geometry.spline import arc_length, tangents
+from needletrack.records import Centerline, Float
+from needletrack.tracking.needle import Positive
+from needletrack.tracking.segment import Mask, Ridges
+
+# Shorter pieces have no direction that could be continued; reduced px.
+_MIN_PIECE_PX = 6
+_END_PX = 10
+_WIDTH_STEP = 0.5
+# Blur widens a line, and a skeleton's width is coarse: only what is clearly too wide is left out here.
+_WIDTH_ALLOWANCE = 1.5
+_NEIGHBOURS = np.array([(-1, -1), (-1, 0), (-1, 1), (0, -1), (0, 1), (1, -1), (1, 0), (1, 1)])
+
+
+class CenterlineParameters(BaseModel):
+    """How lines are followed through crossings and gaps."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    max_gap_mm: Positive = Field(
+        8.0, description="Longest gap, such as a rod in front, that a line is continued across, mm."
+    )
+    max_turn_deg: Positive = Field(35.0, description="Greatest turn at a crossing; a long gap allows a third of it.")
+    min_contrast_gray: Positive = Field(
+        3.0, description="A line differs from what lies on both its sides by this many grey levels."
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class _Piece:
+    """Reduced pixels (N, 2) in order along one unbranched stretch of skeleton, and the width (N,) seen there."""
+
+    points: Float
+    width: Float
+
+    def end(self, which: int) -> tuple[Float, Float]:
+        """Position and outward unit direction of the first (0) or the last (1) end."""
+        stretch = self.points[:_END_PX][::-1] if which == 0 else self.points[-_END_PX:]
+        centered = stretch - stretch.mean(axis=0)
+        axis = np.linalg.svd(centered, full_matrices=False)[2][0]
+        return stretch[-1], axis if axis @ (stretch[-1] - stretch[0]) >= 0 else -axis
+
+
+def trace_centerlines(
+    ridges: Ridges, max_width_px: float, px_per_mm: float, parameters: CenterlineParameters
+) -> list[Centerline]:
+    """Ordered lines of at most the given width, raw px, longest first; which end is the base is not known here."""
+    reach = _WIDTH_ALLOWANCE * max_width_px / ridges.reduction + 1.0
+    pieces: list[_Piece] = []
+    for mask in (ridges.bright, ridges.dark):
+        for points in _skeleton_pieces(mask):
+            pieces.extend(_two_sided(points, ridges, reach, parameters.min_contrast_gray))
+    chains = _linked(pieces, parameters.max_gap_mm * px_per_mm / ridges.reduction, parameters.max_turn_deg)
+    lines = [_centerline(chain, ridges.reduction) for chain in chains]
+    return sorted(lines, key=lambda line: -float(arc_length(line.points_px)[-1]))
+
+
+def _skeleton_pieces(mask: Mask) -> list[Float]:
+    skeleton = skeletonize(mask)
+    neighbours = cv2.filter2D(skeleton.astype(np.uint8), -1, np.ones((3, 3)), borderType=cv2.BORDER_CONSTANT) - 1
+    branching = cv2.dilate((skeleton & (neighbours > 2)).astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+    open_skeleton = skeleton & ~branching
+    count, labels, stats, _ = cv2.connectedComponentsWithStats(open_skeleton.astype(np.uint8), connectivity=8)
+    rows, columns = np.nonzero(open_skeleton)
+    order = np.argsort(labels[rows, columns], kind="stable")
+    pixels = np.column_stack([rows, columns])[order]
+    starts = np.concatenate([[0], np.cumsum(stats[1:, cv2.CC_STAT_AREA])])
+    return [
+        _walk(pixels[starts[i] : starts[i + 1]])[:, ::-1].astype(np.float64)
+        for i in range(count - 1)
+        if starts[i + 1] - starts[i] >= _MIN_PIECE_PX
+    ]
+
+
+def _walk(pixels: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
+    """The pixels (N, 2) of one unbranched stretch, from one end to the other."""
+    left = {(int(r), int(c)) for r, c in pixels}
+    degree = {p: sum((p[0] + dr, p[1] + dc) in left for dr, dc in _STEPS) for p in left}
+    at = min(left, key=lambda p: (degree[p], p))
+    path = [at]
+    left.remove(at)
+    while True:
+        following = [(at[0] + dr, at[1] + dc) for dr, dc in _STEPS if (at[0] + dr, at[1] + dc) in left]
+        if not following:
+            return np.array(path)
+        at = following[0]
+        left.remove(at)
+        path.append(at)
+
+
+# Straight steps before diagonal ones, so that a corner of the staircase is not jumped.
+_STEPS = [(int(r), int(c)) for r, c in sorted(_NEIGHBOURS.tolist(), key=lambda s: abs(s[0]) + abs(s[1]))]
+
+
+def _two_sided(points: Float, ridges: Ridges, max_width: float, min_contrast: float) -> list[_Piece]:
+    """The stretches of a piece that differ from both sides: an edge of something wide differs from one only."""
+    smooth = uniform_filter1d(points, 5, axis=0, mode="nearest")
+    along = tangents(smooth)
+    normal = np.column_stack([-along[:, 1], along[:, 0]])
+    distances = np.arange(_WIDTH_STEP, max_width + 2.0, _WIDTH_STEP)
+    across = smooth[None, None] + np.multiply.outer(np.outer((-1, 1), distances), normal)
+    middle = _sample(ridges.reduced, smooth)
+    differences = _sample(ridges.reduced, across.reshape(-1, 2)).reshape(2, len(distances), -1) - middle
+    side_contrast = np.abs(differences).max(axis=1)
+    brighter = np.minimum(*differences.max(axis=1))
+    darker = np.minimum(*(-differences).max(axis=1))
+    contrast = np.maximum(brighter, darker)
+    width = _WIDTH_STEP * (np.abs(differences) < side_contrast[:, None] / 2).argmin(axis=1).sum(axis=0) + _WIDTH_STEP
+    good = (uniform_filter1d(contrast, 5, mode="nearest") > min_contrast) & (
+        median_filter(width, 9, mode="nearest") <= max_width
+    )
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], good.astype(np.int8), [0]])))
+    return [
+        _Piece(smooth[a:b], width[a:b]) for a, b in zip(edges[::2], edges[1::2], strict=True) if b - a >= _MIN_PIECE_PX
+    ]
+
+
+def _sample(image: npt.NDArray[np.float32], points: Float) -> Float:
+    return np.asarray(map_coordinates(image, points[:, ::-1].T, order=1, mode="nearest"), dtype=np.float64)
+
+
+def _linked(pieces: list[_Piece], max_gap: float, max_turn_deg: float) -> list[list[_Piece]]:
+    """Chains of pieces: every end joins at most one other, the straightest and nearest continuation first."""
+    if not pieces:
+        return []
+    ends = [(i, which) for i in range(len(pieces)) for which in (0, 1)]
+    located = [pieces[i].end(which) for i, which in ends]
+    position = np.array([p for p, _ in located])
+    outward = np.array([d for _, d in located])
+    owner = np.array([i for i, _ in ends])
+    gap = position[None] - position[:, None]
+    distance = np.linalg.norm(gap, axis=2)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        towards = gap / distance[:, :, None]
+    # Across a gap of a pixel or two its direction is noise: only the turn between the pieces counts.
+    far = distance > 4.0
+    turn = np.degrees(np.arccos(np.clip(-(outward @ outward.T), -1, 1)))
+    leave = np.degrees(np.arccos(np.clip(np.where(far, (outward[:, None] * towards).sum(axis=2), 1.0), -1, 1)))
+    worst = np.maximum(turn, np.maximum(leave, leave.T))
+    short = 12.0
+    limit = np.where(
+        distance < short,
+        max_turn_deg,
+        max_turn_deg / 3 + 2 * max_turn_deg / 3 * short / np.maximum(distance, short),
+    )
+    cost = np.where(
+        (owner[:, None] != owner[None]) & (distance < max_gap) & (worst < limit),
+        distance / short + worst / max_turn_deg,
+        np.inf,
+    )
+    joined: dict[int, int] = {}
+    for flat in np.argsort(cost, axis=None, kind="stable"):
+        a, b = divmod(int(flat), len(ends))
+        if not np.isfinite(cost[a, b]):
+            break
+        if a not in joined and b not in joined:
+            joined[a], joined[b] = b, a
+    return _chains(pieces, joined)
+
+
+def _chains(pieces: list[_Piece], joined: dict[int, int]) -> list[list[_Piece]]:
+    done: set[int] = set()
+    chains: list[list[_Piece]] = []
+    # Free ends first; what is left after them is closed loops, which are cut anywhere.
+    for start in sorted(range(2 * len(pieces)), key=lambda e: (e in joined, e)):
+        entry: int | None = start
+        chain: list[_Piece] = []
+        while entry is not None and entry // 2 not in done:
+            piece, which = divmod(entry, 2)
+            done.add(piece)
+            chain.append(pieces[piece] if which == 0 else _Piece(pieces[piece].points[::-1], pieces[piece].width[::-1]))
+            entry = joined.get(2 * piece + 1 - which)
+        if chain:
+            chains.append(chain)
+    return chains
+
+
+def _centerline(chain: list[_Piece], reduction: int) -> Centerline:
+    points = np.concatenate([piece.points for piece in chain])
+    width = np.concatenate([piece.width for piece in chain])
+    return Centerline((points + 0.5) * reduction - 0.5, width * reduction)

@@ -1,0 +1,112 @@
+"""Whether a controller may act on a shape: every weakness has a code, and only a shape without any is ok.
+
+The thresholds follow from what a controller needs, a tip and a shape that are right to a millimetre (docs/status.md).
+"""
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field
+
+from needletrack.errors import NeedleNotFound
+from needletrack.geometry.epipolar import epipolar_lines
+from needletrack.geometry.spline import tangents
+from needletrack.geometry.stereo import StereoRig
+from needletrack.records import Float, NeedleCurve, NeedleTrack, Reason, Status
+from needletrack.tracking.match import inside
+from needletrack.tracking.needle import Needle, Positive, Workspace
+from needletrack.tracking.refine import Refined
+
+# Saturation widens a bright needle by up to this much, mm.
+_SATURATION_MM = 0.35
+
+
+class GateParameters(BaseModel):
+    """How weak a shape may be and still be ok."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    max_sigma_mm: Positive = Field(
+        0.5,
+        description="Largest stated sigma along the shape (95th percentile) and of the tip, mm: half of what counts.",
+    )
+    max_reprojection_rms_px: Positive = Field(
+        0.45, description="Largest rms of the axis points about the projected curve, px."
+    )
+    min_coverage: float = Field(0.85, ge=0, le=1, description="Smallest share of the length that both cameras see.")
+    max_epipolar_share: float = Field(
+        0.5,
+        ge=0,
+        le=1,
+        description="Largest share of the length within epipolar_angle_deg of the epipolar lines.",
+    )
+    epipolar_angle_deg: Positive = Field(
+        12.0, description="A stretch closer than this to the epipolar lines has no depth of its own."
+    )
+    min_tip_contrast: Positive = Field(
+        15.0,
+        description="Height of the needle's signal at the tip over its scatter and over the rest beyond, in each view.",
+    )
+    max_tip_disagreement_mm: Positive = Field(
+        0.5, description="Largest distance along the needle between both views' tips, mm."
+    )
+    max_tip_epipolar_px: Positive = Field(
+        1.0, description="Largest distance of one view's tip from the other's epipolar line, px."
+    )
+    max_step_mm: Positive = Field(15.0, description="Largest motion of the tip since the previous pair, mm.")
+
+
+# With one of these it is another thing than a needle that is seen, and no shape is given.
+_NOT_A_NEEDLE = (Reason.OUTSIDE_WORKSPACE, Reason.TOO_SHORT, Reason.TOO_LONG, Reason.WIDTH_OUT_OF_RANGE)
+
+
+def weaknesses(
+    refined: Refined,
+    curve: NeedleCurve,
+    coverage: float,
+    tip_epipolar_px: float,
+    rig: StereoRig,
+    needle: Needle,
+    workspace: Workspace,
+    parameters: GateParameters,
+    previous: NeedleTrack | None,
+) -> tuple[Reason, ...]:
+    """Why a shape is not ok, in the order of `Reason`; empty where it is.
+
+    Raises NeedleNotFound for a shape that is no needle of the configured kind and place.
+    """
+    tip = refined.tip
+    found = {
+        Reason.OUTSIDE_WORKSPACE: not bool(inside(workspace, curve.points_mm).all()),
+        Reason.TOO_SHORT: curve.length_mm < needle.min_length_mm,
+        Reason.TOO_LONG: curve.length_mm > needle.max_length_mm,
+        Reason.WIDTH_OUT_OF_RANGE: not 0.8 * needle.min_diameter_mm
+        <= refined.diameter_mm
+        <= needle.max_diameter_mm + _SATURATION_MM,
+        Reason.AMBIGUOUS_BASE: not refined.base_is_known,
+        Reason.LOW_COVERAGE: coverage < parameters.min_coverage,
+        Reason.ALONG_EPIPOLAR_LINES: _share_along_epipolar_lines(curve.points_mm, rig, parameters.epipolar_angle_deg)
+        > parameters.max_epipolar_share,
+        Reason.HIGH_RESIDUAL: refined.fit.rms_px > parameters.max_reprojection_rms_px,
+        Reason.HIGH_UNCERTAINTY: float(np.percentile(curve.sigma_mm, 95)) > parameters.max_sigma_mm
+        or max(tip.sigma_mm) > parameters.max_sigma_mm,
+        Reason.TIP_NOT_SEEN: min(tip.contrast) < parameters.min_tip_contrast,
+        Reason.TIP_DISAGREES: abs(tip.each_mm[0] - tip.each_mm[1]) > parameters.max_tip_disagreement_mm
+        or tip_epipolar_px > parameters.max_tip_epipolar_px,
+        Reason.JUMP: previous is not None
+        and previous.status is Status.OK
+        and previous.tip is not None
+        and float(np.linalg.norm(previous.tip.position_mm - curve.points_mm[-1])) > parameters.max_step_mm,
+    }
+    for reason in _NOT_A_NEEDLE:
+        if found[reason]:
+            raise NeedleNotFound("gates", reason)
+    return tuple(reason for reason in Reason if found.get(reason, False))
+
+
+def _share_along_epipolar_lines(points_mm: Float, rig: StereoRig, angle_deg: float) -> float:
+    """Share of the length whose picture in the right view runs along the epipolar lines."""
+    left_px, right_px = rig.project(points_mm)
+    lines = epipolar_lines(rig.fundamental, rig.left.undistort(left_px))
+    along = tangents(rig.right.undistort(right_px))
+    # A line a x + b y + c = 0 of unit (a, b) runs along (b, -a): its normal's product with the tangent is the sine.
+    sine = np.abs((lines[:, :2] * along).sum(axis=1))
+    return float(np.mean(sine < np.sin(np.radians(angle_deg))))

@@ -1,0 +1,211 @@
+"""The configuration: one TOML file, overridden by the environment; config/default.toml explains every key.
+
+The tables of the file are the models below, nested as they are here: `[tracking.needle]` is
+`Config.tracking.needle`, and NEEDLETRACK_TRACKING__NEEDLE__MAX_LENGTH_MM overrides a key of it.
+"""
+
+import hashlib
+import json
+import os
+import re
+import tomllib
+from functools import cached_property
+from pathlib import Path
+from typing import Annotated, Any
+
+from annotated_types import Gt, Le
+from pydantic import (
+    AfterValidator,
+    AllowInfNan,
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    ValidationError,
+)
+from pydantic_settings import BaseSettings, EnvSettingsSource, SettingsConfigDict, SettingsError
+
+from needletrack.errors import ConfigError
+from needletrack.tracking.parameters import TrackingParameters
+from needletrack.validation import complaints, known_keys, nearest_key
+
+ENVIRONMENT_PREFIX = "NEEDLETRACK_"
+
+Positive = Annotated[float, Gt(0), AllowInfNan(False)]
+
+
+def _endpoint(text: str) -> str:
+    # Zenoh's own form, with its options behind ? and #; whether it can be opened shows on opening.
+    if not re.fullmatch(r"[a-z][a-z0-9_-]*/\S+", text):
+        raise ValueError("is no Zenoh endpoint: protocol/address, e.g. tcp/127.0.0.1:7447")
+    return text
+
+
+def _key_prefix(text: str) -> str:
+    if not re.fullmatch(r"[^/*$?#\s]+(/[^/*$?#\s]+)*", text):
+        raise ValueError("is no Zenoh key: parts joined by single slashes, without blanks, *, $, ? and #")
+    return text
+
+
+Endpoint = Annotated[str, AfterValidator(_endpoint)]
+KeyPrefix = Annotated[str, AfterValidator(_key_prefix)]
+# TOML has no null: an empty string says that there is none.
+OptionalPath = Annotated[Path | None, BeforeValidator(lambda value: None if value == "" else value)]
+
+
+class RigConfig(BaseModel):
+    """Which rig is in use."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    path: OptionalPath = Field(
+        None,
+        description="Rig file or Kalibr camchain, relative to this file; empty: a recording's own.",
+    )
+
+
+class PairingConfig(BaseModel):
+    """Which left and right frames belong together."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    tolerance_us: Positive = Field(
+        1000.0, description="Greatest difference of the two stamps of a pair, microseconds."
+    )
+
+
+class PublishingConfig(BaseModel):
+    """Where the tracks go."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    listen: tuple[Endpoint, ...] = Field(
+        ("tcp/127.0.0.1:7447",),
+        description="Zenoh endpoints to listen on, protocol/address; loopback reaches this machine alone.",
+    )
+    connect: tuple[Endpoint, ...] = Field(
+        (), description="Zenoh endpoints to connect to, such as a router's, protocol/address."
+    )
+    key_prefix: KeyPrefix = Field(
+        "needletrack", description="First part of every key: <key_prefix>/<rig>/track."
+    )
+    heartbeat_s: Annotated[Positive, Le(60)] = Field(
+        0.5, description="Interval of the status messages, seconds, at most 60."
+    )
+
+
+class Config(BaseModel):
+    """Everything that can be configured; `Config()` holds the defaults and reads no file or environment."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    rig: RigConfig = Field(RigConfig(), description="Which rig is in use.")
+    tracking: TrackingParameters = Field(
+        TrackingParameters(), description="The needle, where it can be, and how each stage looks for it."
+    )
+    pairing: PairingConfig = Field(PairingConfig(), description="Which frames belong together.")
+    publishing: PublishingConfig = Field(PublishingConfig(), description="Where the tracks go.")
+
+    @cached_property
+    def digest(self) -> str:
+        """Twelve hexadecimal digits (SHA-256) of every value but the rig's path, which has its own digest."""
+        content = json.dumps(self.model_dump(mode="json", exclude={"rig": {"path"}}), sort_keys=True)
+        return hashlib.sha256(content.encode()).hexdigest()[:12]
+
+
+def load_config(path: Path | str | None = None) -> Config:
+    """The configuration of a TOML file (None: the defaults) with the environment's overrides.
+
+    Paths in the file are relative to the file, those in the environment to the working directory. Raises
+    ConfigError that names file or variable, key, value and what is allowed.
+    """
+    # On top of the defaults: a file may set one end of a range and leave the other.
+    values = Config().model_dump()
+    if path is not None:
+        path = Path(path)
+        values = _merged(values, _anchored(_read_toml(path), path.resolve().parent))
+    variables = _variables()
+    values = _merged(values, _anchored(_read_environment(variables), Path.cwd()))
+    try:
+        return Config.model_validate(values)
+    except ValidationError as error:
+        found = [f"{_origin(c.path, variables, path)}: {c.message}" for c in complaints(error, Config)]
+        raise ConfigError("\n".join(found)) from error
+
+
+class _Environment(BaseSettings, Config):
+    """Config, as pydantic-settings wants it for reading the environment."""
+
+    model_config = SettingsConfigDict(
+        env_prefix=ENVIRONMENT_PREFIX, env_nested_delimiter="__", frozen=True, extra="forbid"
+    )
+
+
+def _read_toml(path: Path) -> dict[str, Any]:
+    try:
+        return tomllib.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot read the configuration: {error.strerror or error}") from error
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{path}: not a TOML file: {error}") from error
+
+
+def _variables() -> dict[str, tuple[str, ...]]:
+    """The environment variables that mean us, with their keys; ConfigError for one that no key answers to.
+
+    pydantic-settings lets a variable pass whose first part is no field (its issue 985).
+    """
+    variables = {
+        name: tuple(name.lower().removeprefix(ENVIRONMENT_PREFIX.lower()).split("__"))
+        for name in sorted(os.environ)
+        if name.upper().startswith(ENVIRONMENT_PREFIX)
+    }
+    known = set(known_keys(Config))
+    for name, keys in variables.items():
+        if keys not in known:
+            near = nearest_key(Config, keys)
+            hint = (
+                f"did you mean {_variable(near)}?"
+                if near
+                else "docs/configuration.md tells how they are named"
+            )
+            raise ConfigError(f"environment variable {name}: no such key: {hint}")
+    return variables
+
+
+def _read_environment(variables: dict[str, tuple[str, ...]]) -> dict[str, Any]:
+    try:
+        return EnvSettingsSource(_Environment)()
+    except SettingsError as error:
+        refused = getattr(error.__cause__, "doc", None)
+        name = next((name for name in variables if os.environ[name] == refused), f"{ENVIRONMENT_PREFIX}*")
+        raise ConfigError(
+            f"environment variable {name} = {refused!r}: a list or table is written as JSON, "
+            """e.g. '["tcp/127.0.0.1:7447"]'"""
+        ) from error
+
+
+def _merged(values: dict[str, Any], overrides: dict[str, Any]) -> dict[str, Any]:
+    merged = dict(values)
+    for key, value in overrides.items():
+        below = merged.get(key)
+        merged[key] = _merged(below, value) if isinstance(below, dict) and isinstance(value, dict) else value
+    return merged
+
+
+def _anchored(values: dict[str, Any], folder: Path) -> dict[str, Any]:
+    """The same values with rig.path made absolute."""
+    rig = values.get("rig")
+    if not isinstance(rig, dict) or not isinstance(rig.get("path"), str) or not rig["path"]:
+        return values
+    return {**values, "rig": {**rig, "path": folder / Path(rig["path"]).expanduser()}}
+
+
+def _origin(entry: tuple[str | int, ...], variables: dict[str, tuple[str, ...]], path: Path | None) -> str:
+    """Where a wrong entry was written: the file, or the variables that set it or a part of it."""
+    names = [name for name, keys in variables.items() if keys[: len(entry)] == entry[: len(keys)]]
+    return f"environment variable {', '.join(names)}" if names else str(path)
+
+
+def _variable(keys: tuple[str, ...]) -> str:
+    return ENVIRONMENT_PREFIX + "__".join(keys).upper()

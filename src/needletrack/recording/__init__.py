@@ -1,0 +1,1 @@
+"""Recorded stereo streams: what lies on disk, and playing it as a source of pairs."""

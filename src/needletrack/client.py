@@ -1,0 +1,408 @@
+"""Tracks for Python controllers: typed, with their age, and with the truth about what is missing.
+
+docs/wire.md shows a control loop.
+"""
+
+import statistics
+import threading
+import time
+import weakref
+from collections import deque
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, suppress
+from dataclasses import dataclass
+from enum import StrEnum
+from types import TracebackType
+from typing import Self
+
+import zenoh
+
+from needletrack.errors import PublishError
+from needletrack.publish.keys import DEFAULT_PREFIX, RigKeys
+from needletrack.publish.message import StatusMessage, TrackMessage
+from needletrack.publish.session import DEFAULT_ENDPOINT, direct, open_session
+from needletrack.records import DropReason
+
+__all__ = ["Freshness", "Health", "Missed", "Received", "StatusMessage", "Subscriber", "TrackMessage"]
+
+# A track comes for every pair, also an invalid one: this many periods without any are silence.
+SILENT_PERIODS = 5
+SILENT_AFTER_S = (0.05, 3.0)
+SILENT_BEFORE_RATE_IS_KNOWN_S = 1.0
+PERIODS_REMEMBERED = 16
+HEARTBEATS_MISSED = 3
+
+# Single frames: they never became a pair, and so never had a number that could be missing.
+FRAME_DROPS = frozenset(
+    {
+        DropReason.UNPAIRED_LEFT,
+        DropReason.UNPAIRED_RIGHT,
+        DropReason.STAMP_OUT_OF_ORDER,
+        DropReason.MISSING_IMAGE,
+    }
+)
+
+
+class Freshness(StrEnum):
+    """Whether the newest track may still be acted on; says nothing about its status."""
+
+    FRESH = "fresh"
+    STALE = "stale"
+    SILENT = "silent"
+    GONE = "gone"
+    NEVER_SEEN = "never_seen"
+
+
+@dataclass(frozen=True, slots=True)
+class Health:
+    """The state, one sentence why (empty when fresh), and the newest track's age."""
+
+    state: Freshness
+    reason: str
+    age_ms: float | None
+
+
+@dataclass(frozen=True, slots=True)
+class Missed:
+    """Pairs between a track and the one received before it.
+
+    dropped: by the daemon, as its counters say; lost: on the way; overflowed: here, in the queue of a
+    reader that was too slow.
+    """
+
+    dropped: int = 0
+    lost: int = 0
+    overflowed: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class Received:
+    """One track as it arrived; received_at_ns is Unix time, received_monotonic_ns CLOCK_MONOTONIC."""
+
+    message: TrackMessage
+    received_at_ns: int
+    received_monotonic_ns: int
+    missed: Missed
+
+    @property
+    def transit_ms(self) -> float | None:
+        """From publishing to receiving, by the clocks of both hosts; None in a deterministic replay."""
+        published = self.message.published_at_ns
+        return None if published is None else (self.received_at_ns - published) / 1e6
+
+    @property
+    def latency_ms(self) -> float | None:
+        """From the exposure (live) or the pair's release (replay) to receiving; None where unknown."""
+        transit, before = self.transit_ms, self.message.latency_ms
+        return None if transit is None or before is None else before + transit
+
+    @property
+    def age_ms(self) -> float:
+        """How old the track is now: since the exposure (live) or the pair's release (replay).
+
+        A replay's recorded stamps do not count. At least what this host alone can vouch for, so that a
+        daemon's clock that runs ahead cannot make an old track look young.
+        """
+        here = (time.monotonic_ns() - self.received_monotonic_ns) / 1e6
+        return here + max(self.message.latency_ms or 0.0, self.latency_ms or 0.0)
+
+
+@dataclass(frozen=True, slots=True)
+class _Sample:
+    """A payload as it came in, before anybody had time to read it."""
+
+    payload: bytes
+    arrival: int
+    received_at_ns: int
+    received_monotonic_ns: int
+
+
+class Subscriber:
+    """Receives one rig's tracks; every method may be called from any thread.
+
+    max_age_s: an older track is stale. silent_after_s: silence is noticed after it (None: five periods
+    of the rate seen, 0.05 s at least). capacity: tracks kept for `next` and iteration; the oldest is
+    dropped and counted. It is no error if the daemon is not there yet: `health` says never_seen, and
+    it is found when it comes. Raises PublishError for a malformed endpoint or rig name.
+    """
+
+    def __init__(
+        self,
+        rig: str,
+        connect: Sequence[str] = (DEFAULT_ENDPOINT,),
+        *,
+        listen: Sequence[str] = (),
+        key_prefix: str = DEFAULT_PREFIX,
+        max_age_s: float = 0.2,
+        silent_after_s: float | None = None,
+        capacity: int = 64,
+    ) -> None:
+        self.keys = RigKeys(rig, key_prefix)
+        self._endpoints = (*connect, *listen)
+        self._max_age_ms = max_age_s * 1000
+        self._silent_after_s = silent_after_s
+        # Zenoh's threads take this lock for an append only, and nothing of Zenoh is called under it.
+        self._changed = threading.Condition()
+        self._closed = False
+        self._arrived: deque[_Sample] = deque(maxlen=capacity)
+        self._arrivals = 0
+        self._queue: deque[Received] = deque(maxlen=capacity)
+        self._latest: Received | None = None
+        self._decoded_arrivals = 0
+        self._overflowed_before_next = 0
+        self._last_track_ns: int | None = None
+        self._periods_s: deque[float] = deque(maxlen=PERIODS_REMEMBERED)
+        self._transits_ms: deque[float] = deque(maxlen=PERIODS_REMEMBERED)
+        self._overflowed = 0
+        self._undecodable = 0
+        self._unreadable_reason = ""
+        self._alive: bool | None = None
+        self._status: StatusMessage | None = None
+        self._status_monotonic_ns = 0
+        with ExitStack() as opened:
+            session = opened.enter_context(open_session(listen, connect))
+            # The session object itself is left alone from here on: closing it fails ("Already borrowed")
+            # while another thread calls a method of it.
+            self._info = session.info
+            self._liveliness = session.liveliness()
+            self._status_query = session.declare_querier(self.keys.status)
+            session.declare_subscriber(self.keys.track, direct(self._on_track))
+            session.declare_subscriber(self.keys.status, direct(self._on_status))
+            self._liveliness.declare_subscriber(self.keys.alive, direct(self._on_liveliness), history=True)
+            # A program that ends without `close` closes the session all the same.
+            self._close_session = weakref.finalize(self, opened.pop_all().close)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Close the session and end all iterations; may be called twice."""
+        with self._changed:
+            self._closed = True
+            self._changed.notify_all()
+        self._close_session()
+
+    def __iter__(self) -> Iterator[Received]:
+        """Every track from now on, in order, until `close`."""
+        while (received := self.next()) is not None:
+            yield received
+
+    def next(self, timeout_s: float | None = None) -> Received | None:
+        """The oldest track not yet taken; None where none came within the time, or after `close`."""
+        with self._changed:
+            self._changed.wait_for(lambda: self._closed or self._decode() or bool(self._queue), timeout_s)
+            return self._queue.popleft() if self._queue else None
+
+    def latest(self) -> Received | None:
+        """The newest track, whether taken before or not; None before the first. Never waits."""
+        with self._changed:
+            self._decode()
+            return self._latest
+
+    @property
+    def status(self) -> StatusMessage | None:
+        """The daemon's newest heartbeat; None before the first."""
+        with self._changed:
+            return self._status
+
+    @property
+    def overflowed(self) -> int:
+        """Tracks dropped here because nobody took them in time."""
+        with self._changed:
+            return self._overflowed
+
+    @property
+    def undecodable(self) -> int:
+        """Samples on our keys that were no messages of this version; `health` gives the newest reason."""
+        with self._changed:
+            self._decode()
+            return self._undecodable
+
+    @property
+    def clock_difference_ms(self) -> float | None:
+        """The shortest of the last transits by both clocks: our clock minus the daemon's, plus the way.
+
+        Negative: the daemon's clock is ahead. Large: it is behind, or every track was late. None before
+        the first track, and for a deterministic replay.
+        """
+        with self._changed:
+            self._decode()
+            return min(self._transits_ms, default=None)
+
+    @property
+    def health(self) -> Health:
+        """Whether the newest track may still be acted on."""
+        with self._changed:
+            self._decode()
+            return self._health()
+
+    def wait_for_daemon(self, timeout_s: float) -> None:
+        """Return once the rig's daemon is there; raises PublishError that says what to check."""
+        with self._changed:
+            if self._changed.wait_for(lambda: bool(self._alive) or self._arrivals > 0, timeout_s):
+                return
+        raise PublishError(self._why_no_daemon(timeout_s))
+
+    def wait_until_gone(self, timeout_s: float | None = None) -> bool:
+        """Whether the daemon, once seen, was gone within the time."""
+        with self._changed:
+            self._changed.wait_for(lambda: self._closed or self._alive is False, timeout_s)
+            return self._alive is False
+
+    def _on_track(self, sample: zenoh.Sample) -> None:
+        now_ns, monotonic_ns = time.time_ns(), time.monotonic_ns()
+        payload = sample.payload.to_bytes()
+        with self._changed:
+            if len(self._arrived) == self._arrived.maxlen:
+                self._overflowed += 1
+            self._arrived.append(_Sample(payload, self._arrivals, now_ns, monotonic_ns))
+            self._arrivals += 1
+            self._changed.notify_all()
+
+    def _on_status(self, sample: zenoh.Sample) -> None:
+        self._take_status(sample.payload.to_bytes())
+
+    def _on_status_reply(self, reply: zenoh.Reply) -> None:
+        if reply.ok is not None:
+            self._take_status(reply.ok.payload.to_bytes())
+
+    def _take_status(self, payload: bytes) -> None:
+        monotonic_ns = time.monotonic_ns()
+        try:
+            status = StatusMessage.from_json(payload)
+        except PublishError as error:
+            with self._changed:
+                self._unreadable(str(error))
+            return
+        with self._changed:
+            self._status, self._status_monotonic_ns = status, monotonic_ns
+            self._changed.notify_all()
+
+    def _on_liveliness(self, sample: zenoh.Sample) -> None:
+        alive = sample.kind == zenoh.SampleKind.PUT
+        with self._changed:
+            self._alive = alive
+            self._periods_s.clear()
+            self._last_track_ns = None
+            self._changed.notify_all()
+            closed = self._closed
+        if alive and not closed:
+            # A late joiner has the status at once, not at the next heartbeat.
+            with suppress(zenoh.ZError):  # closed between the check and this line
+                self._status_query.get(direct(self._on_status_reply))
+
+    def _decode(self) -> bool:
+        """Turn what arrived into tracks, in order; whether there were any."""
+        decoded = False
+        while self._arrived:
+            sample = self._arrived.popleft()
+            self._overflowed_before_next += sample.arrival - self._decoded_arrivals
+            self._decoded_arrivals = sample.arrival + 1
+            try:
+                message = TrackMessage.from_json(sample.payload)
+            except PublishError as error:
+                self._unreadable(str(error))
+                continue
+            if message.rig != self.keys.rig:
+                self._unreadable(f"a message of rig {message.rig!r} on {self.keys.track}")
+                continue
+            self._unreadable_reason = ""
+            received = Received(
+                message,
+                sample.received_at_ns,
+                sample.received_monotonic_ns,
+                self._missed(message, self._overflowed_before_next),
+            )
+            self._overflowed_before_next = 0
+            if self._last_track_ns is not None:
+                self._periods_s.append((sample.received_monotonic_ns - self._last_track_ns) / 1e9)
+            self._last_track_ns = sample.received_monotonic_ns
+            if received.transit_ms is not None:
+                self._transits_ms.append(received.transit_ms)
+            if len(self._queue) == self._queue.maxlen:
+                self._overflowed += 1
+            self._queue.append(received)
+            self._latest = received
+            decoded = True
+        if decoded:
+            self._changed.notify_all()
+        return decoded
+
+    def _unreadable(self, reason: str) -> None:
+        self._undecodable += 1
+        self._unreadable_reason = reason
+
+    def _missed(self, message: TrackMessage, overflowed: int) -> Missed:
+        last = None if self._latest is None else self._latest.message
+        if last is None or last.run_id != message.run_id or message.sequence <= last.sequence:
+            return Missed()  # the first of a run: what came before it was not ours to miss
+        gap = message.sequence - last.sequence - 1
+        overflowed = min(gap, overflowed)
+        dropped = min(gap - overflowed, max(0, _pairs_dropped(message) - _pairs_dropped(last)))
+        return Missed(dropped=dropped, lost=gap - overflowed - dropped, overflowed=overflowed)
+
+    def _health(self) -> Health:
+        age_ms = None if self._latest is None else self._latest.age_ms
+        if self._alive is False:
+            return Health(Freshness.GONE, "the daemon stopped, or the link to it broke", age_ms)
+        if self._latest is None or age_ms is None:
+            if self._alive is None and self._undecodable == 0:
+                reason = f"no daemon for rig {self.keys.rig!r} has been seen yet"
+                return Health(Freshness.NEVER_SEEN, reason, None)
+            return Health(Freshness.SILENT, f"no track yet; {self._daemon_says()}", None)
+        silence_s = (time.monotonic_ns() - self._latest.received_monotonic_ns) / 1e9
+        if silence_s > (limit_s := self._silence_limit_s()):
+            reason = f"no track for {silence_s:.2f} s (limit {limit_s:.2f} s); {self._daemon_says()}"
+            return Health(Freshness.SILENT, reason, age_ms)
+        if age_ms > self._max_age_ms:
+            reason = f"the newest track is {age_ms:.0f} ms old (limit {self._max_age_ms:.0f} ms)"
+            if silence_s * 1000 < self._max_age_ms and min(self._transits_ms, default=0.0) > self._max_age_ms:
+                reason += ", all of it on the way: are the clocks of both hosts synchronised?"
+            return Health(Freshness.STALE, reason, age_ms)
+        return Health(Freshness.FRESH, "", age_ms)
+
+    def _silence_limit_s(self) -> float:
+        if self._silent_after_s is not None:
+            return self._silent_after_s
+        if not self._periods_s:
+            return SILENT_BEFORE_RATE_IS_KNOWN_S
+        shortest_s, longest_s = SILENT_AFTER_S
+        return min(max(SILENT_PERIODS * statistics.median(self._periods_s), shortest_s), longest_s)
+
+    def _daemon_says(self) -> str:
+        if self._unreadable_reason:
+            return f"{self._undecodable} samples could not be read, the newest: {self._unreadable_reason}"
+        if self._status is None:
+            return "nor a heartbeat"
+        quiet_s = (time.monotonic_ns() - self._status_monotonic_ns) / 1e9
+        if quiet_s > HEARTBEATS_MISSED * self._status.heartbeat_s:
+            return f"nor a heartbeat for {quiet_s:.1f} s: the daemon hangs, or the link does"
+        error = f", its newest error: {self._status.last_error}" if self._status.last_error else ""
+        return f"the daemon's heart beats ({self._status.state.value}){error}"
+
+    def _why_no_daemon(self, timeout_s: float) -> str:
+        where = " or ".join(self._endpoints)
+        if not self._info.transports():
+            return (
+                f"nobody answers at {where} within {timeout_s:g} s: is the daemon running, does it listen "
+                "on this endpoint (publishing.listen in its configuration), does a firewall stand between?"
+            )
+        others = self._rigs_alive()
+        alive = f"rigs alive there: {', '.join(others)}" if others else "no other rig is alive there either"
+        return (
+            f"{where} answers, but no daemon of rig {self.keys.rig!r} within {timeout_s:g} s: "
+            f"check the rig's name and the key prefix {self.keys.prefix!r} ({alive})"
+        )
+
+    def _rigs_alive(self) -> list[str]:
+        replies = self._liveliness.get(f"{self.keys.prefix}/*/alive", timeout=1.0)
+        return sorted({str(reply.ok.key_expr).split("/")[-2] for reply in replies if reply.ok is not None})
+
+
+def _pairs_dropped(message: TrackMessage) -> int:
+    return sum(count for reason, count in message.dropped.items() if reason not in FRAME_DROPS)

@@ -1,0 +1,54 @@
+"""Where a rig's messages live in Zenoh's key space, and how their encodings are named."""
+
+import re
+from dataclasses import dataclass
+
+from needletrack.errors import PublishError
+
+DEFAULT_PREFIX = "needletrack"
+TRACK_ENCODING = "application/json;needletrack.track.v1"
+STATUS_ENCODING = "application/json;needletrack.status.v1"
+
+# Zenoh gives * $ # ? / a meaning; a leading @ hides a key from wildcards, so that nobody would find the rig.
+_CHUNK = re.compile(r"(?!@)[^/*$#?\s\x00-\x1f\x7f]+")
+
+
+def checked_chunk(name: str, what: str) -> str:
+    """The name, where it can be one chunk of a Zenoh key; raises PublishError otherwise."""
+    if not _CHUNK.fullmatch(name):
+        raise PublishError(
+            f"{what} {name!r} cannot be part of a Zenoh key: use letters, digits, '-', '_' and '.', "
+            "no '/', '*', '$', '#', '?', no space, no leading '@'"
+        )
+    return name
+
+
+@dataclass(frozen=True)
+class RigKeys:
+    """The three keys of one rig, `<prefix>/<rig>/{track,status,alive}`.
+
+    Raises PublishError where rig or prefix cannot be part of a Zenoh key; only the prefix may hold '/'.
+    """
+
+    rig: str
+    prefix: str = DEFAULT_PREFIX
+
+    def __post_init__(self) -> None:
+        checked_chunk(self.rig, "rig name")
+        for chunk in self.prefix.split("/"):
+            checked_chunk(chunk, "key prefix")
+
+    @property
+    def track(self) -> str:
+        """One sample a stereo pair."""
+        return f"{self.prefix}/{self.rig}/track"
+
+    @property
+    def status(self) -> str:
+        """The daemon's heartbeat; answers queries with the newest one."""
+        return f"{self.prefix}/{self.rig}/status"
+
+    @property
+    def alive(self) -> str:
+        """The liveliness token of the daemon."""
+        return f"{self.prefix}/{self.rig}/alive"

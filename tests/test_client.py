@@ -1,0 +1,420 @@
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from functools import partial
+from typing import Any
+
+import numpy as np
+import pytest
+
+from needletrack.client import Freshness, Missed, Received, Subscriber
+from needletrack.errors import PublishError
+from needletrack.publish.message import Instant, RunContext, Source, StatusMessage, TrackMessage
+from needletrack.publish.publisher import ZenohPublisher
+from needletrack.publish.schema import example_messages, example_run, example_track
+from needletrack.publish.session import open_session
+from needletrack.records import Clock, DropReason, Frame, NeedleTrack, Reason, Status, StereoPair
+
+WAIT_S = 10.0
+
+
+@pytest.fixture
+def endpoint() -> str:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+
+
+def status() -> StatusMessage:
+    return example_messages()[1].model_copy(update={"last_error": "camera right: unplugged"})
+
+
+@contextmanager
+def daemon(endpoint: str, run: RunContext | None = None, **options: Any) -> Iterator[ZenohPublisher]:
+    with ZenohPublisher(run or example_run(), status, listen=[endpoint], **options) as publisher:
+        yield publisher
+
+
+def message(
+    sequence: int = 0,
+    *,
+    dropped: Mapping[DropReason, int] | None = None,
+    run: RunContext | None = None,
+    age_ns: int = 0,
+    clock: Clock = Clock.REALTIME,
+) -> TrackMessage:
+    """A message captured age_ns before now, on its own clock; a recorded stamp is 1970's."""
+    now = Instant.now()
+    captured_at_ns = {Clock.REALTIME: now.unix_ns, Clock.MONOTONIC: now.monotonic_ns}.get(
+        clock, age_ns
+    ) - age_ns
+    image = np.zeros((2, 2), dtype=np.uint8)
+    frame = Frame(image, captured_at_ns)
+    released_at_ns = now.monotonic_ns if clock is Clock.RECORDED else None
+    pair = StereoPair(frame, frame, sequence, clock, released_at_ns=released_at_ns)
+    known, _ = example_track(points=8)
+    track = NeedleTrack(captured_at_ns, Status.OK, (), known.curve, known.tip)
+    return TrackMessage.from_track(track, pair, run or example_run(), dropped=dropped or {}, published=now)
+
+
+def patient(connect: Sequence[str], rig: str = "lab", **options: Any) -> Subscriber:
+    """A subscriber to which nothing seems late on a busy machine."""
+    return Subscriber(rig, connect, **({"max_age_s": 60.0, "silent_after_s": 60.0} | options))
+
+
+def state(subscriber: Subscriber) -> Freshness:
+    return subscriber.health.state
+
+
+def taken(subscriber: Subscriber) -> Received:
+    received = subscriber.next(WAIT_S)
+    assert received is not None
+    return received
+
+
+def has_latest(subscriber: Subscriber, sequence: int) -> bool:
+    latest = subscriber.latest()
+    return latest is not None and latest.message.sequence == sequence
+
+
+def eventually(true: Callable[[], bool]) -> bool:
+    """Whether it became true in time; for what nothing announces."""
+    deadline, tick = time.monotonic() + WAIT_S, threading.Event()
+    while not true():
+        if time.monotonic() > deadline:
+            return False
+        tick.wait(0.002)
+    return True
+
+
+def test_tracks_arrive_typed_and_in_order(endpoint: str) -> None:
+    with daemon(endpoint) as publisher, patient([endpoint]) as subscriber:
+        assert publisher.wait_for_subscriber(WAIT_S)
+        sent = [message(sequence) for sequence in range(10)]
+        for one in sent:
+            publisher.publish(one)
+        received = [taken(subscriber) for _ in sent]
+        assert [one.message for one in received] == sent
+        assert all(one.missed == Missed() for one in received)
+        assert subscriber.latest() == received[-1]
+        assert subscriber.next(timeout_s=0.01) is None
+        assert state(subscriber) is Freshness.FRESH
+        assert subscriber.health.reason == ""
+
+
+def test_age_grows_from_the_exposure(endpoint: str) -> None:
+    with daemon(endpoint) as publisher, Subscriber("lab", [endpoint]) as subscriber:
+        assert publisher.wait_for_subscriber(WAIT_S)
+        publisher.publish(message(age_ns=3_000_000_000))
+        received = taken(subscriber)
+        assert received.transit_ms is not None
+        assert received.transit_ms >= 0
+        assert received.latency_ms == pytest.approx(3000 + received.transit_ms, abs=0.01)
+        first, second = received.age_ms, received.age_ms
+        assert 3000 <= first < second
+
+
+def test_gaps_are_told_apart(endpoint: str) -> None:
+    over, unread, lone = DropReason.OVERWRITTEN, DropReason.UNREADABLE_IMAGE, DropReason.UNPAIRED_LEFT
+    with daemon(endpoint) as publisher, patient([endpoint]) as subscriber:
+        assert publisher.wait_for_subscriber(WAIT_S)
+        for sequence, dropped, missed in (
+            (5, {over: 9}, Missed()),  # what came before the first is not ours to miss
+            (6, {over: 9}, Missed()),
+            (9, {over: 11}, Missed(dropped=2)),
+            (12, {over: 11}, Missed(lost=2)),
+            (16, {over: 12}, Missed(dropped=1, lost=2)),
+            (18, {over: 12, unread: 2}, Missed(dropped=1)),  # two bad images, one pair
+            (20, {over: 12, unread: 2, lone: 4}, Missed(lost=1)),  # single frames have no number
+        ):
+            publisher.publish(message(sequence, dropped=dropped))
+            assert taken(subscriber).missed == missed, sequence
+
+
+def test_a_new_run_is_no_gap(endpoint: str) -> None:
+    with patient([endpoint]) as subscriber:
+        for sequence in (3, 90, 0):
+            run = RunContext("lab", Source.LIVE, "c", "r")
+            with daemon(endpoint, run) as publisher:
+                assert publisher.wait_for_subscriber(WAIT_S)
+                publisher.publish(message(sequence, run=run))
+                received = taken(subscriber)
+                assert received.message.run_id == run.run_id
+                assert received.missed == Missed()
+                assert state(subscriber) is Freshness.FRESH
+            assert subscriber.wait_until_gone(WAIT_S)
+            assert state(subscriber) is Freshness.GONE
+
+
+def test_a_reader_that_is_too_slow_loses_the_oldest_and_knows_it(endpoint: str) -> None:
+    with daemon(endpoint) as publisher, patient([endpoint], capacity=2) as subscriber:
+        assert publisher.wait_for_subscriber(WAIT_S)
+        publisher.publish(message(0))
+        assert taken(subscriber).message.sequence == 0
+        for sequence in (1, 2, 3, 6, 7):
+            publisher.publish(message(sequence, dropped={DropReason.OVERWRITTEN: 2 if sequence > 3 else 0}))
+        assert eventually(lambda: subscriber.overflowed == 3)
+        first, second = taken(subscriber), taken(subscriber)
+        assert (first.message.sequence, second.message.sequence) == (6, 7)
+        assert first.missed == Missed(dropped=2, overflowed=3)
+        assert second.missed == Missed()
+
+
+def test_only_looking_at_the_latest_loses_no_count(endpoint: str) -> None:
+    with daemon(endpoint) as publisher, patient([endpoint], capacity=2) as subscriber:
+        assert publisher.wait_for_subscriber(WAIT_S)
+        assert subscriber.latest() is None
+        for sequence in range(6):
+            publisher.publish(message(sequence))
+            assert eventually(partial(has_latest, subscriber, sequence))
+        latest = subscriber.latest()
+        assert latest is not None
+        assert latest.missed == Missed()
+
+
+def test_several_threads_share_the_tracks(endpoint: str) -> None:
+    seen: list[int] = []
+    with daemon(endpoint) as publisher, patient([endpoint]) as subscriber:
+
+        def read() -> None:
+            seen.extend(received.message.sequence for received in subscriber)
+
+        readers = [threading.Thread(target=read) for _ in range(3)]
+        for reader in readers:
+            reader.start()
+        assert publisher.wait_for_subscriber(WAIT_S)
+        for sequence in range(15):
+            publisher.publish(message(sequence))
+        assert eventually(lambda: len(seen) == 15)
+        subscriber.close()
+        for reader in readers:
+            reader.join(WAIT_S)
+            assert not reader.is_alive()
+    assert sorted(seen) == list(range(15))
+
+
+def test_an_old_track_is_stale(endpoint: str) -> None:
+    with (
+        daemon(endpoint) as publisher,
+        Subscriber("lab", [endpoint], max_age_s=2.0, silent_after_s=60.0) as subscriber,
+    ):
+        assert publisher.wait_for_subscriber(WAIT_S)
+        for clock in (Clock.REALTIME, Clock.MONOTONIC):
+            publisher.publish(message(age_ns=3_000_000_000, clock=clock))
+            taken(subscriber)
+            health = subscriber.health
+            assert health.state is Freshness.STALE, clock
+            assert health.age_ms is not None
+            assert health.age_ms >= 3000
+            assert "limit 2000 ms" in health.reason
+
+
+def test_recorded_stamps_make_no_track_stale(endpoint: str) -> None:
+    with (
+        daemon(endpoint) as publisher,
+        Subscriber("lab", [endpoint], max_age_s=30.0, silent_after_s=60.0) as subscriber,
+    ):
+        assert publisher.wait_for_subscriber(WAIT_S)
+        publisher.publish(message(clock=Clock.RECORDED))
+        assert taken(subscriber).message.captured_at_ns < 1_000_000_000
+        assert state(subscriber) is Freshness.FRESH
+
+
+def test_a_track_without_times_ages_from_its_receipt(endpoint: str) -> None:
+    run = RunContext("lab", Source.REPLAY, "c", "r", deterministic=True)
+    with daemon(endpoint, run) as publisher, patient([endpoint]) as subscriber:
+        assert publisher.wait_for_subscriber(WAIT_S)
+        publisher.publish(message(run=run, clock=Clock.RECORDED))
+        received = taken(subscriber)
+        assert (received.transit_ms, received.latency_ms) == (None, None)
+        assert 0 <= received.age_ms < received.age_ms
+        assert state(subscriber) is Freshness.FRESH
+        assert subscriber.clock_difference_ms is None
+
+
+@pytest.mark.parametrize(("ahead_s", "fresh"), [(3600, True), (-3600, False)])
+def test_clocks_that_differ_are_reported_and_never_make_a_track_younger(
+    endpoint: str, ahead_s: int, fresh: bool
+) -> None:
+    with (
+        daemon(endpoint) as publisher,
+        Subscriber("lab", [endpoint], max_age_s=30.0, silent_after_s=60.0) as subscriber,
+    ):
+        assert publisher.wait_for_subscriber(WAIT_S)
+        ours = message()
+        assert ours.published_at_ns is not None
+        theirs = ours.model_copy(
+            update={"published_at_ns": ours.published_at_ns + ahead_s * 1_000_000_000, "latency_ms": 8.0}
+        )
+        publisher.publish(theirs)
+        assert taken(subscriber).age_ms >= 8.0
+        assert subscriber.clock_difference_ms == pytest.approx(-ahead_s * 1000, abs=WAIT_S * 1000)
+        health = subscriber.health
+        assert (health.state is Freshness.FRESH) == fresh
+        assert fresh or "are the clocks of both hosts synchronised?" in health.reason
+
+
+def test_silence_of_a_living_daemon_is_told_with_its_own_words(endpoint: str) -> None:
+    with (
+        daemon(endpoint, heartbeat_s=0.01) as publisher,
+        Subscriber("lab", [endpoint], max_age_s=60.0, silent_after_s=0.05) as subscriber,
+    ):
+        subscriber.wait_for_daemon(WAIT_S)
+        assert state(subscriber) is Freshness.SILENT
+        assert subscriber.health.reason.startswith("no track yet")
+        assert publisher.wait_for_subscriber(WAIT_S)
+        publisher.publish(message())
+        taken(subscriber)
+        assert eventually(lambda: subscriber.status is not None)
+        assert subscriber.next(timeout_s=0.06) is None
+        health = subscriber.health
+        assert health.state is Freshness.SILENT
+        assert "camera right: unplugged" in health.reason
+
+
+def test_silence_is_measured_against_the_rate_seen(endpoint: str) -> None:
+    with daemon(endpoint) as publisher, Subscriber("lab", [endpoint], max_age_s=60.0) as subscriber:
+        assert publisher.wait_for_subscriber(WAIT_S)
+        for sequence in range(20):
+            publisher.publish(message(sequence))
+            taken(subscriber)
+        # They came within milliseconds of each other, so the shortest limit of 50 ms holds.
+        assert subscriber.next(timeout_s=0.06) is None
+        assert state(subscriber) is Freshness.SILENT
+        assert "limit 0.05 s" in subscriber.health.reason
+        publisher.publish(message(20))
+        taken(subscriber)
+        assert state(subscriber) is Freshness.FRESH
+
+
+def test_a_late_joiner_has_the_status_at_once(endpoint: str) -> None:
+    with daemon(endpoint, heartbeat_s=60.0), Subscriber("lab", [endpoint]) as subscriber:
+        assert eventually(lambda: subscriber.status is not None)
+        assert subscriber.status == status()
+
+
+def test_a_daemon_that_comes_later_is_found(endpoint: str) -> None:
+    with patient([endpoint]) as subscriber:
+        assert state(subscriber) is Freshness.NEVER_SEEN
+        with pytest.raises(
+            PublishError, match=f"nobody answers at {endpoint} within 0.05 s: is the daemon running"
+        ):
+            subscriber.wait_for_daemon(0.05)
+        with daemon(endpoint) as publisher:
+            subscriber.wait_for_daemon(WAIT_S)
+            assert publisher.wait_for_subscriber(WAIT_S)
+            publisher.publish(message())
+            assert taken(subscriber).message.rig == "lab"
+
+
+def test_a_wrong_rig_name_is_told_with_the_right_ones(endpoint: str) -> None:
+    with daemon(endpoint), Subscriber("lab", [endpoint]) as right, Subscriber("lob", [endpoint]) as wrong:
+        right.wait_for_daemon(WAIT_S)
+        assert eventually(lambda: "rigs alive there: lab" in why_no_daemon(wrong))
+        assert wrong.health.state is Freshness.NEVER_SEEN
+
+
+def why_no_daemon(subscriber: Subscriber) -> str:
+    with pytest.raises(PublishError) as refused:
+        subscriber.wait_for_daemon(0.0)
+    return str(refused.value)
+
+
+PUBLISHING = """
+import sys, threading
+from needletrack.publish.publisher import ZenohPublisher
+from needletrack.publish.schema import example_messages, example_run
+track, status = example_messages()
+with ZenohPublisher(example_run(), lambda: status, listen=[sys.argv[1]]) as publisher:
+    publisher.wait_for_subscriber(60)
+    publisher.publish(track)
+    sys.stdin.read()
+"""
+
+
+def test_a_killed_daemon_is_gone(endpoint: str) -> None:
+    with (
+        subprocess.Popen([sys.executable, "-c", PUBLISHING, endpoint], stdin=subprocess.PIPE) as process,
+        patient([endpoint]) as subscriber,
+    ):
+        try:
+            subscriber.wait_for_daemon(WAIT_S)
+            taken(subscriber)
+            assert state(subscriber) is not Freshness.GONE
+        finally:
+            process.send_signal(signal.SIGKILL)
+        assert subscriber.wait_until_gone(WAIT_S)
+        assert state(subscriber) is Freshness.GONE
+        assert "stopped, or the link to it broke" in subscriber.health.reason
+
+
+def test_a_hung_daemon_is_gone_after_the_lease(endpoint: str) -> None:
+    with (
+        subprocess.Popen([sys.executable, "-c", PUBLISHING, endpoint], stdin=subprocess.PIPE) as process,
+        patient([endpoint]) as subscriber,
+    ):
+        try:
+            subscriber.wait_for_daemon(WAIT_S)
+            process.send_signal(signal.SIGSTOP)
+            assert subscriber.wait_until_gone(WAIT_S)
+        finally:
+            process.send_signal(signal.SIGKILL)
+
+
+@pytest.mark.parametrize("payload", [b"", b"{}", message().model_copy(update={"rig": "other"}).to_json()])
+def test_what_cannot_be_read_is_counted_and_told(endpoint: str, payload: bytes) -> None:
+    matched = threading.Event()
+    with (
+        patient([], listen=[endpoint]) as subscriber,
+        open_session(connect=[endpoint]) as foreign,
+    ):
+        forger = foreign.declare_publisher(subscriber.keys.track)
+        forger.declare_matching_listener(lambda _: matched.set())
+        assert matched.wait(WAIT_S)
+        forger.put(payload)
+        assert eventually(lambda: subscriber.undecodable == 1)
+        assert subscriber.latest() is None
+        assert state(subscriber) is Freshness.SILENT
+        assert "1 samples could not be read" in subscriber.health.reason
+        forger.put(message().to_json())
+        assert taken(subscriber).missed == Missed()
+        assert state(subscriber) is Freshness.FRESH
+
+
+def test_an_invalid_track_is_as_fresh_as_any(endpoint: str) -> None:
+    now = Instant.now()
+    frame = Frame(np.zeros((2, 2), dtype=np.uint8), now.unix_ns)
+    track = NeedleTrack(now.unix_ns, Status.INVALID, (Reason.NO_CANDIDATE,))
+    pair = StereoPair(frame, frame, 0, Clock.REALTIME)
+    with daemon(endpoint) as publisher, patient([endpoint]) as subscriber:
+        assert publisher.wait_for_subscriber(WAIT_S)
+        publisher.publish(TrackMessage.from_track(track, pair, example_run(), dropped={}, published=now))
+        assert taken(subscriber).message.status is Status.INVALID
+        assert state(subscriber) is Freshness.FRESH
+
+
+def test_closing_ends_the_iteration_and_may_happen_twice(endpoint: str) -> None:
+    subscriber = Subscriber("lab", [endpoint])
+    with subscriber:
+        subscriber.close()
+        assert list(subscriber) == []
+    assert subscriber.next() is None
+
+
+@pytest.mark.parametrize(
+    "left_open",
+    ["Subscriber('lab', [e])", "ZenohPublisher(example_run(), lambda: example_messages()[1], listen=[e])"],
+)
+def test_a_program_that_closes_nothing_ends_all_the_same(endpoint: str, left_open: str) -> None:
+    program = (
+        "import sys; from needletrack.client import Subscriber\n"
+        "from needletrack.publish.publisher import ZenohPublisher\n"
+        "from needletrack.publish.schema import example_messages, example_run\n"
+        f"e = sys.argv[1]; left_open = {left_open}"
+    )
+    assert subprocess.run([sys.executable, "-c", program, endpoint], timeout=30, check=False).returncode == 0

@@ -1,6 +1,7 @@
 """The frozen records that cross from one stage to the next.
 
-Arrays are checked for shape on construction and made read-only; a record never changes. Shapes are
+Arrays are checked for shape on construction and made read-only; a record never changes, and one that
+holds arrays is equal to itself alone. Shapes are
 base -> tip, lengths in millimetres in the left camera's frame, pixels raw (distorted) unless a name
 says `undistorted`; see the package docstring for the conventions.
 """
@@ -121,7 +122,7 @@ class DropReason(StrEnum):
     OVERWRITTEN = "overwritten"
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class Frame:
     """One camera's image (rows, columns) of uint8 and the driver's own stamp of it."""
 
@@ -132,7 +133,7 @@ class Frame:
         object.__setattr__(self, "image", frozen_array(self.image, (None, None), "image", np.uint8))
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class StereoPair:
     """Two frames of one instant; the pair's stamp is the left camera's.
 
@@ -158,7 +159,7 @@ class StereoPair:
         return (self.right.captured_at_ns - self.left.captured_at_ns) / 1000
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class Centerline:
     """A thin structure in one image, traced in order: points_px (N, 2) raw pixels, width_px (N,)."""
 
@@ -175,7 +176,7 @@ class Centerline:
         return Centerline(self.points_px[::-1], self.width_px[::-1])
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class Correspondences:
     """Matched points of both views, left_undistorted_px and right_undistorted_px (N, 2), in order along the needle."""
 
@@ -189,7 +190,7 @@ class Correspondences:
         object.__setattr__(self, "right_undistorted_px", right)
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class NeedleCurve:
     """The needle's axis in space, base -> tip, evenly spaced along the arc.
 
@@ -212,7 +213,7 @@ class NeedleCurve:
         object.__setattr__(self, "curvature_per_mm", frozen_array(self.curvature_per_mm, (n,), "curvature_per_mm"))
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class TipPose:
     """The free end: position_mm (3,), unit direction (3,) out of the tip, orientation_xyzw (4,).
 
@@ -237,7 +238,7 @@ class TipPose:
             object.__setattr__(self, "velocity_mm_s", frozen_array(self.velocity_mm_s, (3,), "velocity_mm_s"))
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class BasePose:
     """Where the needle leaves its sleeve or the image: position_mm (3,), unit direction (3,) along the needle."""
 
@@ -263,7 +264,7 @@ class Quality:
     coverage: float | None = None
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class Evidence:
     """What the stages saw on the way, for pictures and reports; no part of the wire."""
 
@@ -272,7 +273,7 @@ class Evidence:
     correspondences: Correspondences | None = None
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class NeedleTrack:
     """The answer for one stereo pair, also when it is `invalid` (then curve, tip and base are None).
 

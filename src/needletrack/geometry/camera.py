@@ -13,7 +13,7 @@ DISTORTION_LENGTHS = (4, 5, 8, 12, 14)
 _UNDISTORT_UNTIL = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-12)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Camera:
     """Camera matrix K (3, 3), distortion (n,) in OpenCV's order k1 k2 p1 p2 [k3 ...], size_px (width, height).
 

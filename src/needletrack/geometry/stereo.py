@@ -15,7 +15,7 @@ from needletrack.records import Float
 MIN_BASELINE_MM = 1e-3
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class StereoRig:
     """Left and right camera and the pose between them; the left camera's frame is the world frame.
 

@@ -12,7 +12,7 @@ from needletrack.records import Float, frozen_array
 ORTHONORMAL_TOLERANCE = 1e-6
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class RigidTransform:
     """`a_from_b`: rotation (3, 3) and translation_mm (3,) take points of frame b into frame a.
 

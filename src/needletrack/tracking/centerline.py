@@ -20,7 +20,6 @@ _END_PX = 10
 _WIDTH_STEP = 0.5
 # Blur widens a line, and a skeleton's width is coarse: only what is clearly too wide is left out here.
 _WIDTH_ALLOWANCE = 1.5
-_NEIGHBOURS = np.array([(-1, -1), (-1, 0), (-1, 1), (0, -1), (0, 1), (1, -1), (1, 0), (1, 1)])
 
 
 class CenterlineParameters(BaseModel):
@@ -67,40 +66,48 @@ def trace_centerlines(
 
 
 def _skeleton_pieces(mask: Mask) -> list[Float]:
-    skeleton = skeletonize(mask)
+    left, top, width, height = cv2.boundingRect(mask.astype(np.uint8))
+    if width == 0:
+        return []
+    # A rim of background, for the neighbours; what is outside the bounding box costs time and holds nothing.
+    skeleton = np.pad(skeletonize(mask[top : top + height, left : left + width]), 1)
     neighbours = cv2.filter2D(skeleton.astype(np.uint8), -1, np.ones((3, 3)), borderType=cv2.BORDER_CONSTANT) - 1
     branching = cv2.dilate((skeleton & (neighbours > 2)).astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
-    open_skeleton = skeleton & ~branching
-    count, labels, stats, _ = cv2.connectedComponentsWithStats(open_skeleton.astype(np.uint8), connectivity=8)
+    open_skeleton = (skeleton & ~branching).astype(np.uint8)
+    count, labels, stats, _ = cv2.connectedComponentsWithStats(open_skeleton, connectivity=8)
+    degree = cv2.filter2D(open_skeleton, -1, np.ones((3, 3)), borderType=cv2.BORDER_CONSTANT)
     rows, columns = np.nonzero(open_skeleton)
-    order = np.argsort(labels[rows, columns], kind="stable")
-    pixels = np.column_stack([rows, columns])[order]
+    # Sorted by piece, and an end of each piece before its other pixels.
+    order = np.lexsort((degree[rows, columns], labels[rows, columns]))
+    flat = (rows * open_skeleton.shape[1] + columns)[order]
     starts = np.concatenate([[0], np.cumsum(stats[1:, cv2.CC_STAT_AREA])])
-    return [
-        _walk(pixels[starts[i] : starts[i + 1]])[:, ::-1].astype(np.float64)
-        for i in range(count - 1)
-        if starts[i + 1] - starts[i] >= _MIN_PIECE_PX
-    ]
+    pieces = []
+    for i in range(count - 1):
+        if starts[i + 1] - starts[i] >= _MIN_PIECE_PX:
+            path = _walk(flat[starts[i] : starts[i + 1]].tolist(), open_skeleton.shape[1])
+            row, column = np.divmod(path, open_skeleton.shape[1])
+            pieces.append(np.column_stack([column + left - 1.0, row + top - 1.0]))
+    return pieces
 
 
-def _walk(pixels: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
-    """The pixels (N, 2) of one unbranched stretch, from one end to the other."""
-    left = {(int(r), int(c)) for r, c in pixels}
-    degree = {p: sum((p[0] + dr, p[1] + dc) in left for dr, dc in _STEPS) for p in left}
-    at = min(left, key=lambda p: (degree[p], p))
+def _walk(pixels: list[int], width: int) -> npt.NDArray[np.int64]:
+    """The pixels of one unbranched stretch, as flat indices into an image of that width, in order from the first."""
+    # Straight steps before diagonal ones, so that a corner of the staircase is not jumped.
+    steps = (1, -1, width, -width, width + 1, width - 1, 1 - width, -1 - width)
+    left = set(pixels)
+    at = pixels[0]
     path = [at]
     left.remove(at)
-    while True:
-        following = [(at[0] + dr, at[1] + dc) for dr, dc in _STEPS if (at[0] + dr, at[1] + dc) in left]
-        if not following:
-            return np.array(path)
-        at = following[0]
-        left.remove(at)
-        path.append(at)
-
-
-# Straight steps before diagonal ones, so that a corner of the staircase is not jumped.
-_STEPS = [(int(r), int(c)) for r, c in sorted(_NEIGHBOURS.tolist(), key=lambda s: abs(s[0]) + abs(s[1]))]
+    while left:
+        for step in steps:
+            if at + step in left:
+                at += step
+                left.remove(at)
+                path.append(at)
+                break
+        else:
+            break
+    return np.array(path)
 
 
 def _two_sided(points: Float, ridges: Ridges, max_width: float, min_contrast: float) -> list[_Piece]:

@@ -41,7 +41,7 @@ class EndsParameters(BaseModel):
     )
     sleeve_step_gray: Positive = Field(
         8.0,
-        description="The sleeve differs from what is beside the needle, on both sides and in both views, by this, grey.",
+        description="The sleeve differs from what is beside the needle, on both sides in both views, by this, grey.",
     )
     sleeve_step_mm: Positive = Field(2.5, description="Length of needle and of sleeve that are compared, mm.")
 

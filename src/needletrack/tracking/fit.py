@@ -137,7 +137,8 @@ def fit_curve(
     share = min(1.0, float(length[-1]) / (len(points_mm) - 1) / parameters.correlation_mm)
     smooth = _smoothness_matrix(count, float(length[-1]), parameters)
     normal = prior + smooth
-    for _ in range(4):
+    # On the way the next round corrects what two steps leave.
+    for _ in range(4 if hold_mm is None else 2):
         normal = prior + smooth
         gradient = -(smooth @ control.ravel())
         points = b @ control

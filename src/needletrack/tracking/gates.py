@@ -25,8 +25,8 @@ class GateParameters(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     max_sigma_mm: Positive = Field(
-        0.5,
-        description="Largest stated sigma along the shape (95th percentile) and of the tip, mm: half of what counts.",
+        0.4,
+        description="Largest stated sigma along the shape (95th percentile) and of the tip, mm; 1 mm is 2.5 of it.",
     )
     max_reprojection_rms_px: Positive = Field(
         0.45, description="Largest rms of the axis points about the projected curve, px."

@@ -18,7 +18,7 @@ from needletrack.tracking.needle import Positive
 Mask = npt.NDArray[np.bool_]
 Gray = npt.NDArray[np.float32]
 # Reduced images keep the thinnest needle about this wide, px: thinner ones drown in noise, wider ones only cost time.
-_REDUCED_WIDTH_PX = 1.2
+_REDUCED_WIDTH_PX = 0.9
 
 
 class SegmentParameters(BaseModel):
@@ -63,18 +63,21 @@ def find_ridges(image: Image, width_range_px: tuple[float, float], parameters: S
 def _line_responses(image: Gray, sigmas_px: tuple[float, ...]) -> tuple[Gray, Gray]:
     bright = np.zeros_like(image)
     dark = np.zeros_like(image)
+    border = cv2.BORDER_REPLICATE
     for sigma in sigmas_px:
-        blurred = cv2.GaussianBlur(image, (0, 0), sigma, borderType=cv2.BORDER_REPLICATE)
-        xx, yy, xy = (
-            cv2.Sobel(blurred, cv2.CV_32F, dx, dy, ksize=3, scale=0.25 * sigma**2, borderType=cv2.BORDER_REPLICATE)
-            for dx, dy in ((2, 0), (0, 2), (1, 1))
-        )
-        mean = (xx + yy) / 2
-        spread = cv2.magnitude((xx - yy) / 2, xy)
-        lowest, highest = mean - spread, mean + spread
-        # A line curves across and not along; a blob or a corner curves both ways.
-        np.maximum(bright, np.where(-lowest > 2 * np.abs(highest), -lowest, 0), out=bright)
-        np.maximum(dark, np.where(highest > 2 * np.abs(lowest), highest, 0), out=dark)
+        blurred = cv2.GaussianBlur(image, (0, 0), sigma, borderType=border)
+        xx = cv2.Sobel(blurred, cv2.CV_32F, 2, 0, ksize=1, scale=sigma**2, borderType=border)
+        yy = cv2.Sobel(blurred, cv2.CV_32F, 0, 2, ksize=1, scale=sigma**2, borderType=border)
+        xy = cv2.Sobel(blurred, cv2.CV_32F, 1, 1, ksize=3, scale=0.25 * sigma**2, borderType=border)
+        # The eigenvalues of the Hessian are mean -+ spread. A line curves across and hardly along: the stronger one is
+        # more than twice the other, which is |mean| between a third of the spread and three times it.
+        mean = cv2.addWeighted(xx, 0.5, yy, 0.5, 0.0)
+        spread = cv2.magnitude(cv2.addWeighted(xx, 0.5, yy, -0.5, 0.0), xy)
+        size = np.abs(mean)
+        strength = size + spread
+        strength *= (3 * size > spread) & (size < 3 * spread)
+        np.maximum(bright, strength, out=bright, where=mean < 0)
+        np.maximum(dark, strength, out=dark, where=mean > 0)
     for response in (bright, dark):
         response[[0, -1]] = 0
         response[:, [0, -1]] = 0
@@ -84,8 +87,10 @@ def _line_responses(image: Gray, sigmas_px: tuple[float, ...]) -> tuple[Gray, Gr
 def _without_side_lobes(bright: Gray, dark: Gray) -> tuple[Gray, Gray]:
     # Beside a line of one polarity the second derivative has lobes of the other, 0.45 of its height (Gaussian profile).
     reach = np.ones((9, 9), np.uint8)
-    near_dark, near_bright = cv2.dilate(dark, reach), cv2.dilate(bright, reach)
-    return np.where(bright > 0.6 * near_dark, bright, 0), np.where(dark > 0.6 * near_bright, dark, 0)
+    share = np.float32(0.6)
+    bright_mask = cv2.compare(bright, cv2.dilate(dark, reach) * share, cv2.CMP_GT)
+    dark_mask = cv2.compare(dark, cv2.dilate(bright, reach) * share, cv2.CMP_GT)
+    return np.where(bright_mask > 0, bright, np.float32(0)), np.where(dark_mask > 0, dark, np.float32(0))
 
 
 def _hysteresis(response: Gray, parameters: SegmentParameters) -> Mask:

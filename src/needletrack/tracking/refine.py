@@ -46,7 +46,14 @@ class RefineParameters(BaseModel):
         description="On the way, a stretch that a view does not see stays about this near to the prediction, mm.",
     )
     settled_mm: Positive = Field(2.0, description="A round that lengthens the curve by less than this is the last, mm.")
-    max_rounds: int = Field(15, ge=2, description="Rounds of observing and fitting; each may lengthen the curve.")
+    max_rounds: int = Field(
+        15, ge=2, description="Rounds of observing and fitting after a detection, each of which may lengthen the curve."
+    )
+    max_tracking_rounds: int = Field(
+        2,
+        ge=1,
+        description="Rounds from the track of the pair before: between two pairs a needle moves and grows little.",
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,11 +85,20 @@ class Refined:
 
 
 def refine(
-    images: Images, rig: StereoRig, points_mm: Float, models: RefineModels, previous_base_mm: Float | None
+    images: Images,
+    rig: StereoRig,
+    points_mm: Float,
+    models: RefineModels,
+    max_rounds: int,
+    previous_base_mm: Float | None = None,
 ) -> Refined:
-    """Follow the needle from a rough curve (N, 3) in space; raises NeedleNotFound where the views do not show it."""
+    """Follow the needle from a rough curve (N, 3) in space; raises NeedleNotFound where the views do not show it.
+
+    Each of at most max_rounds rounds lengthens the curve by up to reach_mm at both ends. previous_base_mm (3,) tells
+    base from tip where no sleeve is seen.
+    """
     spacing = models.refine.spacing_mm
-    points, diameter_mm = _follow(images, rig, points_mm, models)
+    points, diameter_mm = _follow(images, rig, points_mm, models, max_rounds)
     extended, observed = _observe_extended(images, rig, points, diameter_mm, models)
     stretch = needle_stretch(observed, spacing, models.ends)
     if stretch.stop - stretch.start < 2:
@@ -123,30 +139,33 @@ def _tip_px(view: AxisObservations, end: EndObservation) -> Float:
     return np.asarray(view.center_px[-1] + view.offset_px[-1] * normal + end.shift_px * along)
 
 
-def _follow(images: Images, rig: StereoRig, points_mm: Float, models: RefineModels) -> tuple[Float, float]:
-    """Observe, fit and lengthen until the ends stay where they are; the curve (N, 3) and the needle's diameter."""
-    points = points_mm
+def _follow(
+    images: Images, rig: StereoRig, points_mm: Float, models: RefineModels, max_rounds: int
+) -> tuple[Float, float]:
+    """Observe, fit and lengthen until it grows no more; the curve (N, 3) and the needle's diameter."""
+    spacing = models.refine.spacing_mm
+    points, longest_mm = points_mm, 0.0
     diameter_mm: float | None = None
-    turn = 0
-    while True:
+    for remaining in reversed(range(max_rounds)):
         extended, observed = _observe_extended(images, rig, points, diameter_mm, models)
-        stretch = needle_stretch(observed, models.refine.spacing_mm, models.ends)
+        stretch = needle_stretch(observed, spacing, models.ends)
         start, stop = stretch.start, stretch.stop
         part = (observed[0].part(start, stop), observed[1].part(start, stop))
         seen_mm = _diameter_mm(part, rig, extended[start:stop])
-        if seen_mm is None or (stop - start) * models.refine.spacing_mm < models.needle.min_length_mm / 2:
+        if seen_mm is None or (stop - start) * spacing < models.needle.min_length_mm / 2:
             raise NeedleNotFound("refine", Reason.LOW_COVERAGE)
         diameter_mm = seen_mm
         fit = fit_curve(extended[start:stop], part, rig, models.fit, hold_mm=models.refine.hold_mm)
-        grown_mm = (stop - start) * models.refine.spacing_mm - arc_length(points)[-1]
-        points = _sampled(fit, models.refine.spacing_mm)
-        if arc_length(points)[-1] < models.needle.min_length_mm / 2:
+        points = _sampled(fit, spacing)
+        length_mm = float(arc_length(points)[-1])
+        if length_mm < models.needle.min_length_mm / 2:
             raise NeedleNotFound("refine", Reason.TOO_SHORT)
-        if arc_length(points)[-1] > 2 * models.needle.max_length_mm:
+        if length_mm > 2 * models.needle.max_length_mm:
             raise NeedleNotFound("refine", Reason.TOO_LONG)
-        if turn + 1 == models.refine.max_rounds or (turn >= 1 and grown_mm < models.refine.settled_mm):
+        if remaining == 0 or 0 < length_mm <= longest_mm + models.refine.settled_mm:
             return points, diameter_mm
-        turn += 1
+        longest_mm = max(longest_mm, length_mm)
+    raise ValueError("max_rounds must be one or more")
 
 
 def _observe_extended(

@@ -40,8 +40,10 @@ from needletrack.tracking.segment import find_ridges
 # Candidates this close to the best one in score are examined as well: two that hold make the shape ambiguous.
 _RIVAL_SHARE = 0.4
 _SAME_SHAPE_MM = 2.0
-# A weak track is searched for anew once in so many pairs; a track that holds needs no search.
-_PAIRS_PER_SEARCH = 10
+# A weak track is searched for anew once in so many pairs, sooner where its shape is in doubt; one that holds needs none.
+_PAIRS_PER_SEARCH = 30
+_PAIRS_PER_SEARCH_IN_DOUBT = 10
+_IN_DOUBT = {Reason.AMBIGUOUS_BASE, Reason.LOW_COVERAGE, Reason.HIGH_RESIDUAL, Reason.TIP_NOT_SEEN}
 _MAX_VELOCITY_INTERVAL_NS = 250_000_000
 
 
@@ -161,12 +163,14 @@ def _from_previous(
     try:
         with stopwatch("refine"):
             base_mm = None if previous.base is None else previous.base.position_mm
-            refined = refine(images, rig, previous.curve.points_mm, _models(parameters), base_mm)
+            rounds = parameters.refine.max_tracking_rounds
+            refined = refine(images, rig, previous.curve.points_mm, _models(parameters), rounds, base_mm)
             found = _Found(refined, rig, parameters, previous, Evidence(), previous.since_detection + 1)
     except NeedleNotFound:
         # Lost is not yet gone: the search that follows decides, and its reason is the one that is told.
         return None
-    return found if not found.reasons or previous.since_detection + 1 < _PAIRS_PER_SEARCH else None
+    allowed = _PAIRS_PER_SEARCH_IN_DOUBT if _IN_DOUBT & set(found.reasons) else _PAIRS_PER_SEARCH
+    return found if not found.reasons or found.since_detection < allowed else None
 
 
 def _from_images(
@@ -218,7 +222,7 @@ def _examine(
     previous: NeedleTrack | None,
 ) -> _Found:
     rough = initial_curve(candidate.points_mm, candidate.confidence, parameters.refine.spacing_mm, parameters.fit)
-    refined = refine(images, rig, rough, _models(parameters), None)
+    refined = refine(images, rig, rough, _models(parameters), parameters.refine.max_rounds)
     evidence = Evidence(candidate.left, candidate.right, candidate.correspondences)
     return _Found(refined, rig, parameters, previous, evidence, 0)
 

@@ -18,6 +18,10 @@ Observed = tuple[AxisObservations, AxisObservations]
 _ON_LINE_PX = 1.0
 _DENSITY_WINDOW_MM = 4.0
 _MIN_DENSITY = 0.42
+# An edge is blurred over about this much of the curve.
+_EDGE_GAP_MM = 0.5
+_SLEEVE_SHARE = 0.7
+_CROSSED_MM = 2.0
 # Between two pairs the base moves less than this.
 _BASE_MOTION_MM = 8.0
 # Lengths of taper that are tried for the tip, mm: blunt or round ends, and cones. What is between them is blur.
@@ -42,6 +46,9 @@ class EndsParameters(BaseModel):
     sleeve_step_gray: Positive = Field(
         8.0,
         description="The sleeve differs from what is beside the needle, on both sides in both views, by this, grey.",
+    )
+    min_sleeve_mm: Positive = Field(
+        6.0, description="A sleeve is at least so long: what is shorter crosses the needle, mm."
     )
     sleeve_step_mm: Positive = Field(2.5, description="Length of needle and of sleeve that are compared, mm.")
 
@@ -69,8 +76,7 @@ def needle_stretch(observed: Observed, spacing_mm: float, parameters: EndsParame
     window = max(3, round(_DENSITY_WINDOW_MM / spacing_mm))
     firm = np.mean([_on_smooth_line(view, window) for view in observed], axis=0)
     present = (firm > 0) & (uniform_filter1d(firm, window, mode="nearest") > _MIN_DENSITY)
-    sleeve = find_sleeve_edge(observed, spacing_mm, parameters)
-    found = sleeve if sleeve.step_gray >= parameters.sleeve_step_gray else None
+    found = find_sleeve_edge(observed, firm, spacing_mm, parameters)
     if found is not None:
         before, after = firm[: found.index].sum(), firm[found.index :].sum()
         present[: found.index] &= before > after
@@ -98,36 +104,73 @@ def _on_smooth_line(view: AxisObservations, window: int) -> Mask:
     return np.asarray(view.firm & (np.abs(offset - median_filter(offset, window, mode="nearest")) < _ON_LINE_PX))
 
 
-def find_sleeve_edge(observed: Observed, spacing_mm: float, parameters: EndsParameters) -> SleeveEdge:
-    """The strongest place where both flanks change in the same sense in both views.
+def find_sleeve_edge(
+    observed: Observed, firm: Float, spacing_mm: float, parameters: EndsParameters
+) -> SleeveEdge | None:
+    """The strongest place where both flanks change in the same sense in both views, and stay changed.
 
-    A vessel that crosses behind lies at another place of the curve in each view, a rod beside it on one side only.
+    A vessel that crosses behind lies at another place of the curve in each view and is soon past, a rod beside it is on
+    one side only. firm (N,) is the share of views that show the needle, which is on the other side of the edge.
     """
-    n = max(2, round(parameters.sleeve_step_mm / spacing_mm))
-    weakest = np.min([_common_step(view.flank_gray, n, max(1, round(0.5 / spacing_mm))) for view in observed], axis=0)
-    index = int(np.argmax(weakest))
-    return SleeveEdge(index, float(weakest[index]))
+    steps = np.stack([_steps(view.flank_gray, spacing_mm, parameters) for view in observed])
+    same = np.abs(np.sign(steps).sum(axis=1)) == 2
+    weakest = np.where(same.all(axis=0), np.abs(steps).min(axis=(0, 1)), 0.0)
+    reach = round(parameters.sleeve_step_mm / spacing_mm)
+    while weakest.size and weakest.max() >= parameters.sleeve_step_gray:
+        index = int(np.argmax(weakest))
+        outward = 1 if firm[:index].sum() > firm[index:].sum() else -1
+        if _stays_changed(observed, index, outward, spacing_mm, parameters):
+            return SleeveEdge(index, float(weakest[index]))
+        weakest[max(0, index - reach) : index + reach + 1] = 0.0
+    return None
 
 
-def _common_step(flanks: Float, length: int, gap: int) -> Float:
-    """Step (N,) between the means behind and ahead, the smaller of both sides; zero where their signs differ."""
+def _stays_changed(observed: Observed, index: int, outward: int, spacing_mm: float, parameters: EndsParameters) -> bool:
+    """Whether both flanks of both views keep their change over the least length of a sleeve, as far as it is seen."""
+    gap, near = round(_EDGE_GAP_MM / spacing_mm), round(parameters.sleeve_step_mm / spacing_mm)
+    far = round(parameters.min_sleeve_mm / spacing_mm)
+    at = np.arange(observed[0].flank_gray.shape[1])
+    inward = (outward * (index - at) > gap) & (outward * (index - at) <= gap + near)
+    beyond = (outward * (at - index) > gap) & (outward * (at - index) <= far)
+    if not inward.any() or beyond.sum() < near:
+        return False
+    for view in observed:
+        change = view.flank_gray[:, beyond] - view.flank_gray[:, inward].mean(axis=1, keepdims=True)
+        # Its shading and highlights may pass through the background's own level, but do not stay there.
+        if ((np.abs(change) > parameters.sleeve_step_gray / 3).mean(axis=1) < _SLEEVE_SHARE).any():
+            return False
+    return True
+
+
+def is_crossed(observed: Observed, at_mm: float, arc_mm: Float, parameters: EndsParameters) -> bool:
+    """Whether in either view something begins beside a place of the curve: an end there may be hidden, not free."""
+    near = np.abs(arc_mm - at_mm) <= _CROSSED_MM
+    spacing_mm = float(arc_mm[1] - arc_mm[0])
+    steps = [np.abs(_steps(view.flank_gray, spacing_mm, parameters)[:, near]) for view in observed]
+    return bool(max(float(step.max(initial=0.0)) for step in steps) > parameters.sleeve_step_gray)
+
+
+def _steps(flanks: Float, spacing_mm: float, parameters: EndsParameters) -> Float:
+    """Change (2, N) of each flank's mean grey level from behind a place to ahead of it; zero near the curve's ends."""
+    length = max(2, round(parameters.sleeve_step_mm / spacing_mm))
+    gap = max(1, round(_EDGE_GAP_MM / spacing_mm))
     total = np.cumsum(np.pad(flanks, ((0, 0), (1, 0))), axis=1)
     n = flanks.shape[1]
     at = np.arange(n)
-    low, high = np.clip(at - gap - length, 0, n), np.clip(at - gap, 0, n)
-    low2, high2 = np.clip(at + gap, 0, n), np.clip(at + gap + length, 0, n)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        step = (total[:, high2] - total[:, low2]) / (high2 - low2) - (total[:, high] - total[:, low]) / (high - low)
-    enough = (high - low >= length // 2) & (high2 - low2 >= length // 2)
-    same = np.sign(step[0]) == np.sign(step[1])
-    return np.where(enough & same, np.abs(step).min(axis=0), 0.0)
+    behind = (np.clip(at - gap - length, 0, n), np.clip(at - gap, 0, n))
+    ahead = (np.clip(at + gap, 0, n), np.clip(at + gap + length, 0, n))
+    counts = [np.maximum(stop - start, 1) for start, stop in (behind, ahead)]
+    means = [(total[:, b] - total[:, a]) / count for (a, b), count in zip((behind, ahead), counts, strict=True)]
+    enough = (counts[0] >= length // 2) & (counts[1] >= length // 2)
+    return np.where(enough, means[1] - means[0], 0.0)
 
 
 @dataclass(frozen=True, slots=True)
 class TipFit:
     """The apex along the curve, mm from its first point: of each view alone and of both; sigma_mm; taper_mm; contrast.
 
-    `contrast` is the height of the needle's signal over what lies beyond the tip, in units of their scatter.
+    `contrast` is the height of the needle's signal over what lies beyond the tip, in units of their scatter; is_free is
+    false where something crosses there, behind which the needle may go on.
     """
 
     at_mm: float
@@ -135,9 +178,12 @@ class TipFit:
     sigma_mm: tuple[float, float]
     taper_mm: float
     contrast: tuple[float, float]
+    is_free: bool
 
 
-def find_tip(observed: Observed, arc_mm: Float, end_mm: float, smoothed_mm: float) -> TipFit:
+def find_tip(
+    observed: Observed, arc_mm: Float, end_mm: float, smoothed_mm: float, parameters: EndsParameters
+) -> TipFit:
     """Where the needle's signal ends beyond a rough end, the curve running on past it.
 
     The signal across the needle falls linearly over the taper of a cone and within the radius of a round tip; the
@@ -175,6 +221,7 @@ def find_tip(observed: Observed, arc_mm: Float, end_mm: float, smoothed_mm: floa
         (sigma[0], sigma[1]),
         float(_TAPERS_MM[taper]),
         (contrast[0], contrast[1]),
+        not is_crossed(observed, float(tips[tip]), arc_mm, parameters),
     )
 
 

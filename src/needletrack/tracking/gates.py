@@ -88,7 +88,7 @@ def weaknesses(
         Reason.HIGH_RESIDUAL: refined.fit.rms_px > parameters.max_reprojection_rms_px,
         Reason.HIGH_UNCERTAINTY: float(np.percentile(curve.sigma_mm, 95)) > parameters.max_sigma_mm
         or max(tip.sigma_mm) > parameters.max_sigma_mm,
-        Reason.TIP_NOT_SEEN: min(tip.contrast) < parameters.min_tip_contrast,
+        Reason.TIP_NOT_SEEN: min(tip.contrast) < parameters.min_tip_contrast or not tip.is_free,
         Reason.TIP_DISAGREES: abs(tip.each_mm[0] - tip.each_mm[1]) > parameters.max_tip_disagreement_mm
         or tip_epipolar_px > parameters.max_tip_epipolar_px,
         Reason.JUMP: previous is not None

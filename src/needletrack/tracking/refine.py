@@ -112,7 +112,7 @@ def refine(
         extended, observed = extended[::-1], (observed[0].turned(), observed[1].turned())
         stretch = Stretch(len(extended) - stretch.stop, len(extended) - stretch.start, stretch.sleeve)
     arc = arc_length(extended)
-    tip = find_tip(observed, arc, float(arc[stretch.stop - 1]), models.axis.smooth_along_mm)
+    tip = find_tip(observed, arc, float(arc[stretch.stop - 1]), models.axis.smooth_along_mm, models.ends)
     if tip.at_mm - arc[stretch.start] < models.needle.min_length_mm / 2:
         raise NeedleNotFound("refine", Reason.TOO_SHORT)
     # The final curve ends at the tip itself; its last points are held by the taper's edges and the spline's stiffness.

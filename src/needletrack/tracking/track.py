@@ -40,7 +40,7 @@ from needletrack.tracking.segment import find_ridges
 # Candidates this close to the best one in score are examined as well: two that hold make the shape ambiguous.
 _RIVAL_SHARE = 0.4
 _SAME_SHAPE_MM = 2.0
-# A weak track is searched for anew once in so many pairs, sooner where its shape is in doubt; one that holds needs none.
+# A weak track is searched for anew once in so many pairs, sooner where its shape is in doubt; one that holds is not.
 _PAIRS_PER_SEARCH = 30
 _PAIRS_PER_SEARCH_IN_DOUBT = 10
 _IN_DOUBT = {Reason.AMBIGUOUS_BASE, Reason.LOW_COVERAGE, Reason.HIGH_RESIDUAL, Reason.TIP_NOT_SEEN}

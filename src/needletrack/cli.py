@@ -1,0 +1,323 @@
+"""The command line: each command turns arguments into one call of the package, and its answer into text.
+
+Exit codes: 0; 1 where something failed that was not the caller's to prevent; 2 where something given cannot
+be used, with one line on stderr that says what and the remedy; 130 after Ctrl-C.
+"""
+
+import os
+from collections.abc import Callable
+from datetime import UTC, datetime
+from functools import wraps
+from math import acos, degrees
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal, ParamSpec
+
+import typer
+from rich.console import Console
+
+from needletrack import __version__
+from needletrack.errors import CalibrationError, NeedletrackError
+from needletrack.publish.keys import DEFAULT_PREFIX
+from needletrack.publish.session import DEFAULT_ENDPOINT
+
+if TYPE_CHECKING:
+    from needletrack.rig import Rig
+
+# What loads NumPy, SciPy and OpenCV is imported by the commands themselves: they read these variables when
+# they are loaded. For matrices as small as ours, two threads took twice the time of one.
+for _variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "OPENCV_FOR_THREADS_NUM"):
+    os.environ.setdefault(_variable, "1")
+
+LAB_RECORDING = Path("tests/data/recordings/lab-a")
+_TABLE_WIDTH = 160
+
+app = typer.Typer(
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    rich_markup_mode="markdown",
+    help="Track a needle in 3D from two cameras, and publish its shape over Zenoh.",
+)
+rig_app = typer.Typer(no_args_is_help=True, help="Rig files: both cameras and the pose between them.")
+config_app = typer.Typer(no_args_is_help=True, help="The configuration file.")
+app.add_typer(rig_app, name="rig")
+app.add_typer(config_app, name="config")
+
+P = ParamSpec("P")
+
+Recording = Annotated[
+    Path, typer.Argument(metavar="RECORDING", help="Folder in the EuRoC/ASL layout (docs/recordings.md).")
+]
+ConfigFile = Annotated[Path | None, typer.Option("--config", help="TOML file (docs/configuration.md).")]
+RigPath = Annotated[Path, typer.Argument(metavar="PATH", help="Rig file, Kalibr camchain, or a folder with either.")]
+
+
+def plain_errors(command: Callable[P, None]) -> Callable[P, None]:
+    """The same command, which tells an error that we raise on purpose in one line, and exits with 2."""
+
+    @wraps(command)
+    def told(*args: P.args, **kwargs: P.kwargs) -> None:
+        try:
+            command(*args, **kwargs)
+        except NeedletrackError as error:
+            _complain(error)
+            raise typer.Exit(2) from error
+
+    return told
+
+
+@app.command()
+@plain_errors
+def demo(
+    recording: Recording,
+    output: Annotated[Path, typer.Option(help="Folder for pictures and tracks.")] = Path("build/demo"),
+    seconds: Annotated[float, typer.Option(min=0.1, help="About how long to play.")] = 11.0,
+) -> None:
+    """Track a recording at its own pace, and watch the tracks arrive in another process.
+
+    Played forward and backward in turn, through the live loop and over Zenoh on this machine alone.
+    """
+    from needletrack.demo import SubscriberFailed, run_demo
+    from needletrack.terminal import Interruption, warnings_shown
+
+    typer.echo(f"needletrack demo: {recording}, about {seconds:g} s, tracks received by another process")
+    with Interruption() as interruption, warnings_shown(Console(stderr=True), at_end=True):
+        try:
+            report = run_demo(recording, output, seconds=seconds, stop=interruption.stop)
+        except SubscriberFailed as error:
+            if not interruption.exit_code:  # Ctrl-C reaches the subscriber too
+                _complain(error)
+            raise typer.Exit(interruption.exit_code or 1) from error
+    typer.echo(report)
+    raise typer.Exit(interruption.exit_code)
+
+
+@app.command()
+@plain_errors
+def replay(
+    recording: Recording,
+    rig: Annotated[
+        Path | None,
+        typer.Option(
+            help="Rig file or Kalibr camchain. Without it: rig.path of the configuration; without that: "
+            "the recording's own rig.yaml or camchain.yaml."
+        ),
+    ] = None,
+    config: ConfigFile = None,
+    paced: Annotated[
+        bool,
+        typer.Option(
+            "--paced/--every-frame",
+            help="At the recorded pace, as live: what comes too fast is dropped and counted. Or every pair, "
+            "as fast as it goes: the same output bytes every time.",
+        ),
+    ] = False,
+    independent: Annotated[
+        bool, typer.Option("--independent", help="Start every pair without memory: for recordings of stills.")
+    ] = False,
+    start: Annotated[int, typer.Option(min=0, help="First pair, from 0.")] = 0,
+    end: Annotated[int | None, typer.Option(min=0, help="The pair after the last; all without it.")] = None,
+    loop: Annotated[int, typer.Option(min=1, help="Play so many times, forward and backward in turn.")] = 1,
+    method: Annotated[Literal["curve", "reference"], typer.Option(help="Ours, or that of 2017.")] = "curve",
+    output: Annotated[
+        Path | None, typer.Option(help="Write the tracks: .jsonl (all) or .csv (no centerlines).")
+    ] = None,
+    publish: Annotated[
+        str | None, typer.Option(metavar="ENDPOINT", help=f"Publish on Zenoh, e.g. {DEFAULT_ENDPOINT}.")
+    ] = None,
+) -> None:
+    """Track a recording through the same service that runs live.
+
+    Every readable pair gives a track, unless --paced drops it; the summary, on stderr, counts what was lost
+    by reason. Exit code 0; 1 where no pair could be tracked; 2 where something given cannot be used; 130
+    after Ctrl-C, which ends it with what was done so far.
+    """
+    from needletrack.config import load_config
+    from needletrack.replay import Replay, open_recording
+    from needletrack.terminal import Interruption, ProgressBar, described, warnings_shown
+
+    effective, console = load_config(config), Console(stderr=True)
+    with Interruption() as interruption, warnings_shown(console):
+        played = Replay(
+            open_recording(recording, effective, rig),
+            effective,
+            method=method,
+            paced=paced,
+            independent=independent,
+            start=start,
+            end=end,
+            loop=loop,
+        )
+        with ProgressBar(console, start, len(played.source)) as progress:
+            summary = played.run(interruption.stop, output=output, publish=publish, sinks=[progress])
+    typer.echo(described(summary), err=True)
+    raise typer.Exit(interruption.exit_code or (0 if summary.pairs else 1))
+
+
+@app.command()
+@plain_errors
+def watch(
+    rig: Annotated[str, typer.Argument(metavar="RIG", help="The rig's name, which is part of the key.")],
+    connect: Annotated[
+        list[str] | None,
+        typer.Option(metavar="ENDPOINT", help=f"Where the daemon is; default {DEFAULT_ENDPOINT}."),
+    ] = None,
+    key_prefix: Annotated[str, typer.Option(help="As in the daemon's configuration.")] = DEFAULT_PREFIX,
+    until_gone: Annotated[bool, typer.Option("--until-gone", help="End when the daemon does.")] = False,
+    count: Annotated[int | None, typer.Option(min=1, help="End after so many tracks.")] = None,
+    wait: Annotated[
+        float | None,
+        typer.Option(min=0, metavar="SECONDS", help="Wait so long for the daemon; else for ever."),
+    ] = None,
+    report: Annotated[Path | None, typer.Option(help="Write the summary there, as JSON.")] = None,
+) -> None:
+    """Show a rig's tracks as they arrive, until Ctrl-C."""
+    from needletrack.terminal import write_summary
+    from needletrack.watch import watch as watch_tracks
+
+    summary = watch_tracks(
+        rig,
+        connect or [DEFAULT_ENDPOINT],
+        key_prefix=key_prefix,
+        until_gone=until_gone,
+        count=count,
+        wait_s=wait,
+    )
+    if report is None:
+        typer.echo(summary, err=True)
+    else:
+        write_summary(summary, report)
+
+
+@rig_app.command("show")
+@plain_errors
+def rig_show(path: RigPath) -> None:
+    """Summarise a rig."""
+    from needletrack.replay import rig_at
+
+    _show_rig(rig_at(path))
+
+
+@rig_app.command("import")
+@plain_errors
+def rig_import(
+    camchain: Annotated[Path, typer.Argument(metavar="CAMCHAIN", help="Kalibr's camchain.yaml.")],
+    output: Annotated[Path, typer.Option(help="The rig file to write.")] = Path("rig.yaml"),
+    name: Annotated[str | None, typer.Option(help="The rig's name; else its folder's.")] = None,
+) -> None:
+    """Make a rig file from a Kalibr camchain."""
+    from needletrack.rig import import_camchain, write_rig
+
+    imported = import_camchain(camchain, name)
+    write_rig(imported, output)
+    _show_rig(imported)
+    typer.echo(f"written: {output}")
+
+
+@rig_app.command("check")
+@plain_errors
+def rig_check(path: RigPath, config: ConfigFile = None) -> None:
+    """Check that a rig can be true, and that it sees some of the configured workspace."""
+    from needletrack.config import load_config
+    from needletrack.replay import rig_at
+
+    checked = rig_at(path)
+    checked.require_view_of(load_config(config).tracking.workspace)
+    typer.echo(f"{path}: ok, rig {checked.name}, digest {checked.digest}")
+
+
+@config_app.command("show")
+@plain_errors
+def config_show(
+    path: Annotated[Path | None, typer.Argument(metavar="PATH", help="TOML file; without it, the defaults.")] = None,
+) -> None:
+    """Print what is in effect, as JSON: defaults, file, and environment."""
+    from needletrack.config import load_config
+
+    typer.echo(load_config(path).model_dump_json(indent=2))
+
+
+@config_app.command("check")
+@plain_errors
+def config_check(path: Annotated[Path, typer.Argument(metavar="PATH", help="TOML file.")]) -> None:
+    """Check a configuration file, together with the environment's overrides."""
+    from needletrack.config import load_config
+
+    typer.echo(f"{path}: ok, digest {load_config(path).digest}")
+
+
+@app.command()
+@plain_errors
+def calibrate(
+    recording: Annotated[Path, typer.Argument(metavar="RECORDING", help="Recording of the board: ten views or more.")],
+    square_mm: Annotated[float, typer.Option(help="Side of a square, mm.")],
+    squares: Annotated[str, typer.Option(help="Squares across and down.")] = "11x11",
+    output: Annotated[Path, typer.Option(help="The rig file to write.")] = Path("rig.yaml"),
+    name: Annotated[str | None, typer.Option(help="The rig's name; else the recording's.")] = None,
+) -> None:
+    """Make a rig file from a recording of a checkerboard."""
+    from needletrack.calibration.board import Checkerboard
+    from needletrack.recording.board import calibrate_from_recording
+    from needletrack.rig import write_rig
+
+    across, down = _parsed(squares)
+    board = Checkerboard(across, down, square_mm)
+    found = calibrate_from_recording(recording, board, name or recording.resolve().name, datetime.now(UTC))
+    write_rig(found.rig, output)
+    for sentence in found.left_out:
+        typer.echo(f"left out: {sentence}", err=True)
+    _show_rig(found.rig)
+    typer.echo(f"worst view {found.worst_view_rms_px:.3f} px rms; written: {output}")
+
+
+@app.command()
+@plain_errors
+def table1(
+    recording: Annotated[Path, typer.Argument(metavar="RECORDING", help="Recording of stills.")] = LAB_RECORDING,
+    repeats: Annotated[int, typer.Option(min=1, help="Runs of each stage; the median counts.")] = 9,
+) -> None:
+    """Repeat Table 1 of the 2017 paper, beside the paper's figures and our method."""
+    from needletrack.table1 import render
+    from needletrack.table1 import table1 as measured
+
+    console = Console()
+    # In a file or a pipe, a table is as wide as it needs to be.
+    console = console if console.is_terminal else Console(width=_TABLE_WIDTH)
+    console.print(render(measured(recording, repeats)))
+
+
+@app.command()
+def version() -> None:
+    """Print the version."""
+    typer.echo(__version__)
+
+
+def _complain(error: Exception) -> None:
+    typer.echo(f"needletrack: {error}", err=True)
+
+
+def _parsed(squares: str) -> tuple[int, int]:
+    across, _, down = squares.lower().partition("x")
+    if not (across.isdecimal() and down.isdecimal()):
+        raise CalibrationError(f"--squares {squares!r}: write it as 11x11, squares across and down")
+    return int(across), int(down)
+
+
+def _show_rig(rig: "Rig") -> None:
+    typer.echo(f"rig         {rig.name}, digest {rig.digest}")
+    for side, camera in (("left", rig.left), ("right", rig.right)):
+        (fx, _, cx), (_, fy, cy), _ = camera.matrix.tolist()
+        width, height = camera.size_px
+        lens = " ".join(f"{coefficient:.5g}" for coefficient in camera.distortion)
+        matrix = f"f {fx:.2f} {fy:.2f} px, centre {cx:.2f} {cy:.2f} px"
+        typer.echo(f"{side:11} {width}x{height} px, {matrix}, distortion {lens}")
+    apart = degrees(acos(min(rig.right_from_left.rotation[2, 2], 1.0)))
+    typer.echo(f"pose        baseline {rig.baseline_mm:.2f} mm, optical axes {apart:.2f}° apart")
+    info, facts = rig.calibration, []
+    facts.append(f"by {info.method}")
+    if info.calibrated_at is not None:
+        facts.append(f"{info.calibrated_at:%Y-%m-%d %H:%M %Z}")
+    if info.reprojection_rms_px is not None:
+        facts.append(f"{info.reprojection_rms_px:.3f} px rms")
+    if info.views is not None:
+        facts.append(f"{info.views} views")
+    typer.echo(f"calibrated  {', '.join([*facts, info.source] if info.source else facts)}")

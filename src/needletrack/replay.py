@@ -1,0 +1,142 @@
+"""A recording through the live loop: what the replay command, its tool and the demo share."""
+
+import re
+from collections.abc import Sequence
+from contextlib import ExitStack, suppress
+from pathlib import Path
+from threading import Event
+from typing import Literal
+
+from needletrack.config import Config
+from needletrack.publish.message import RunContext, Source, TrackMessage
+from needletrack.publish.publisher import ZenohPublisher
+from needletrack.recording.asl import AslRecording, UnusablePair
+from needletrack.recording.replay import ReplaySource
+from needletrack.recording.tracks import TrackFile
+from needletrack.records import NeedleTrack, StereoPair
+from needletrack.rig import Rig, find_rig, import_camchain, read_rig
+from needletrack.service import RunSummary, Service, Sink, Tracker
+from needletrack.tracking.reference import track_reference
+from needletrack.tracking.track import track_pair
+
+Method = Literal["curve", "reference"]
+
+
+class Replay:
+    """A recording that is ready to run through the same service as live pairs.
+
+    method: our own, or the 2017 reference. paced: at the recorded pace, pairs are dropped where tracking is
+    too slow; otherwise every pair is tracked, and two runs give the same bytes. independent: every pair
+    starts without memory. start, end, loop: as of ReplaySource. Raises CalibrationError where the rig sees
+    nothing of the workspace, RecordingError where there is nothing to play.
+    """
+
+    def __init__(
+        self,
+        recording: AslRecording,
+        config: Config,
+        *,
+        method: Method = "curve",
+        paced: bool = False,
+        independent: bool = False,
+        start: int = 0,
+        end: int | None = None,
+        loop: int = 1,
+    ) -> None:
+        rig = recording.rig
+        rig.require_view_of(config.tracking.workspace)
+        self._publishing = config.publishing
+        self._recording, self._start, self._paced = recording, start, paced
+        self._tracker = _tracker(method, rig, config)
+        self.source = ReplaySource(recording, paced=paced, start=start, end=end, loop=loop)
+        self.context = RunContext(rig.name, Source.REPLAY, config.digest, rig.digest, deterministic=not paced)
+        self.service = Service(
+            self.source,
+            self._tracker,
+            rig,
+            self.context,
+            every_frame=not paced,
+            independent=independent,
+            heartbeat_s=config.publishing.heartbeat_s,
+        )
+
+    def warm_up(self) -> None:
+        """Track the first pair once, for nothing: the first call of every library takes a multiple of the next."""
+        with suppress(UnusablePair):  # it will be counted when its turn comes
+            self._tracker(self._recording.read(self._start), None)
+
+    def publisher(self, endpoint: str) -> ZenohPublisher:
+        """Where this run's messages are published: listens on `endpoint`, the rest as configured."""
+        return ZenohPublisher(
+            self.context,
+            self.service.status,
+            listen=[endpoint],
+            connect=self._publishing.connect,
+            key_prefix=self._publishing.key_prefix,
+            heartbeat_s=self._publishing.heartbeat_s,
+        )
+
+    def run(
+        self,
+        stop: Event,
+        *,
+        output: Path | None = None,
+        publish: str | None = None,
+        sinks: Sequence[Sink] = (),
+    ) -> RunSummary:
+        """Play to the end or until `stop` is set, into a file of tracks, to an endpoint, and into sinks."""
+        if self._paced:
+            self.warm_up()
+        with ExitStack() as opened:
+            into: list[Sink] = []
+            # Opened before the endpoint: a file that cannot be written must not be announced on the wire.
+            if output is not None:
+                into.append(opened.enter_context(TrackFile(output)))
+            if publish is not None:
+                into.insert(0, Published(opened.enter_context(self.publisher(publish))))
+            return self.service.run([*into, *sinks], stop)
+
+
+class Published:
+    """A sink that publishes every message."""
+
+    def __init__(self, publisher: ZenohPublisher) -> None:
+        self._publisher = publisher
+
+    def take(self, pair: StereoPair, track: NeedleTrack, message: TrackMessage) -> None:
+        """Publish the message; waits for no subscriber."""
+        self._publisher.publish(message)
+
+
+def open_recording(folder: Path, config: Config, rig_path: Path | None = None) -> AslRecording:
+    """A recording with its rig: rig_path's, else that of the configuration's rig.path, else its own.
+
+    Raises RecordingError, CalibrationError.
+    """
+    chosen = rig_path or config.rig.path
+    rig = None if chosen is None else rig_at(chosen)
+    return AslRecording(folder, rig, tolerance_us=config.pairing.tolerance_us)
+
+
+def rig_at(path: Path) -> Rig:
+    """The rig in a rig file, in a Kalibr camchain, or in a folder with either; raises CalibrationError."""
+    if path.is_dir():
+        return find_rig(path)
+    return import_camchain(path) if _is_camchain(path) else read_rig(path)
+
+
+def _is_camchain(path: Path) -> bool:
+    # What cannot be read is no camchain: reading it as a rig file then says why.
+    with suppress(OSError, UnicodeDecodeError):
+        return re.search(r"(?m)^cam0\s*:", path.read_text(encoding="utf-8")) is not None
+    return False
+
+
+def _tracker(method: Method, rig: Rig, config: Config) -> Tracker:
+    def by_curve(pair: StereoPair, previous: NeedleTrack | None) -> NeedleTrack:
+        return track_pair(pair, rig, config.tracking, previous)
+
+    def by_reference(pair: StereoPair, previous: NeedleTrack | None) -> NeedleTrack:
+        return track_reference(pair, rig)
+
+    return by_reference if method == "reference" else by_curve

@@ -1,0 +1,226 @@
+"""The live loop: pairs in, tracks out, every loss counted.
+
+A capture thread takes pairs from the source and puts each into a one-place slot in which the latest wins; the worker,
+which is the thread that calls `run`, takes the newest pair, tracks it and hands track and message to the sinks. An
+every-frame replay has no slot: each pair is tracked before the next is read, so that nothing depends on time.
+"""
+
+import threading
+import time
+from collections import Counter, deque
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from typing import NamedTuple, Protocol
+
+from needletrack.capture.source import FrameSource
+from needletrack.publish.message import (
+    Instant,
+    RunContext,
+    ServiceState,
+    StatusMessage,
+    TrackMessage,
+    WireCalibration,
+    WireRates,
+)
+from needletrack.records import DropReason, NeedleTrack, Status, StereoPair
+from needletrack.rig import Rig
+
+
+# A daemon runs for days: its memory must not grow with them.
+_TIMES_KEPT = 10_000
+
+
+class Tracker(Protocol):
+    """A method of tracking: the pair, and the track of the pair before, to the track of this one."""
+
+    def __call__(self, pair: StereoPair, previous: NeedleTrack | None) -> NeedleTrack:
+        """The track of this pair; raises for nothing that the images show."""
+        ...
+
+
+class Sink(Protocol):
+    """Whoever wants the results: a publisher, a file, a progress bar; must return at once, or tracking waits."""
+
+    def take(self, pair: StereoPair, track: NeedleTrack, message: TrackMessage) -> None:
+        """One pair's result, in order; what it raises ends the run."""
+        ...
+
+
+@dataclass(frozen=True)
+class RunSummary:
+    """What a run did: tracks by status, losses by reason, duration, and the worker's time for each of the last pairs."""
+
+    statuses: Mapping[Status, int]
+    reasons: Mapping[str, int]
+    dropped: Mapping[DropReason, int]
+    duration_s: float
+    tracking_ms: tuple[float, ...]
+
+    @property
+    def pairs(self) -> int:
+        """Pairs that were tracked."""
+        return sum(self.statuses.values())
+
+
+class Arrival(NamedTuple):
+    """A pair, and what had been lost when it came: a gap in the sequence and its count stand in one message."""
+
+    pair: StereoPair
+    dropped: Mapping[DropReason, int]
+
+
+class Service:
+    """Runs one source through one tracker into sinks.
+
+    independent: every pair starts without memory. every_frame: no pair is skipped however slow tracking is; otherwise
+    the newest pair wins and the one it overwrites is counted. The counters may be read from any thread.
+    """
+
+    def __init__(
+        self,
+        source: FrameSource,
+        tracker: Tracker,
+        rig: Rig,
+        run: RunContext,
+        *,
+        every_frame: bool = False,
+        independent: bool = False,
+        heartbeat_s: float = 0.5,
+    ) -> None:
+        self._source, self._tracker, self._rig, self._run = source, tracker, rig, run
+        self._every_frame, self._independent, self._heartbeat_s = every_frame, independent, heartbeat_s
+        self._slot = LatestSlot()
+        self._state = ServiceState.STARTING
+        self._started_s = time.monotonic()
+        self._statuses: Counter[Status] = Counter()
+        self._reasons: Counter[str] = Counter()
+        self._last_sequence: int | None = None
+        self._reported = (self._started_s, 0, Counter[Status]())
+
+    @property
+    def dropped(self) -> dict[DropReason, int]:
+        """Frames and pairs lost so far, by reason."""
+        dropped = Counter(self._source.dropped)
+        if self._slot.overwritten:
+            dropped[DropReason.OVERWRITTEN] += self._slot.overwritten
+        return dict(dropped)
+
+    def run(self, sinks: Sequence[Sink], stop: threading.Event) -> RunSummary:
+        """Track until the source ends or `stop` is set; the first exception of any thread ends the run, raised here."""
+        self._state = ServiceState.RUNNING
+        started_s = time.monotonic()
+        tracking_ms: deque[float] = deque(maxlen=_TIMES_KEPT)
+        previous: NeedleTrack | None = None
+        try:
+            for pair, dropped in self._every_pair(stop) if self._every_frame else self._newest_pairs(stop):
+                began_s = time.perf_counter()
+                track = self._tracker(pair, None if self._independent else previous)
+                tracking_ms.append((time.perf_counter() - began_s) * 1e3)
+                previous = track
+                self._statuses[track.status] += 1
+                self._reasons.update(track.reasons)
+                self._last_sequence = pair.sequence
+                message = TrackMessage.from_track(track, pair, self._run, dropped=dropped, published=Instant.now())
+                for sink in sinks:
+                    sink.take(pair, track, message)
+        finally:
+            self._state = ServiceState.STOPPING
+        duration_s = time.monotonic() - started_s
+        return RunSummary(dict(self._statuses), dict(self._reasons), self.dropped, duration_s, tuple(tracking_ms))
+
+    def status(self) -> StatusMessage:
+        """The heartbeat's content; its rates are those since the last call."""
+        now_s, done = time.monotonic(), self._statuses.copy()
+        delivered = sum(done.values()) + self._slot.overwritten
+        since_s, delivered_before, done_before = self._reported
+        self._reported = (now_s, delivered, done)
+        elapsed_s = max(now_s - since_s, 1e-3)
+        rates = WireRates(
+            pairs_per_s=round((delivered - delivered_before) / elapsed_s, 2),
+            tracks_per_s={
+                status.value: round((done[status] - done_before[status]) / elapsed_s, 2) for status in Status
+            },
+        )
+        return StatusMessage.from_run(
+            self._run,
+            state=self._state,
+            heartbeat_s=self._heartbeat_s,
+            published_at_ns=time.time_ns(),
+            uptime_s=now_s - self._started_s,
+            last_sequence=self._last_sequence,
+            calibration=_calibration(self._rig),
+            rates=rates,
+            dropped=self.dropped,
+            counters={f"tracks_{status.value}": done[status] for status in Status},
+        )
+
+    def _every_pair(self, stop: threading.Event) -> Iterator[Arrival]:
+        for pair in self._source.pairs(stop):
+            yield Arrival(pair, dict(self._source.dropped))
+
+    def _newest_pairs(self, stop: threading.Event) -> Iterator[Arrival]:
+        capture = threading.Thread(target=self._capture, args=(stop,), name="needletrack-capture")
+        capture.start()
+        try:
+            while (arrival := self._slot.take()) is not None:
+                yield arrival
+        finally:
+            # Also where a sink raised: the capture thread must not outlive the run.
+            stop.set()
+            capture.join()
+        if self._slot.failure is not None:
+            raise self._slot.failure
+
+    def _capture(self, stop: threading.Event) -> None:
+        failure: BaseException | None = None
+        try:
+            for pair in self._source.pairs(stop):
+                self._slot.put(Arrival(pair, dict(self._source.dropped)))
+        except BaseException as error:  # raised again by the worker
+            failure = error
+        finally:
+            self._slot.close(failure)
+
+
+class LatestSlot:
+    """One place between two threads in which the latest pair wins; what it overwrites is counted."""
+
+    def __init__(self) -> None:
+        self._changed = threading.Condition()
+        self._arrival: Arrival | None = None
+        self._closed = False
+        self.overwritten = 0
+        self.failure: BaseException | None = None
+
+    def put(self, arrival: Arrival) -> None:
+        """Leave a pair for the worker, in place of one that it has not taken."""
+        with self._changed:
+            self.overwritten += self._arrival is not None
+            self._arrival = arrival
+            self._changed.notify()
+
+    def take(self) -> Arrival | None:
+        """The newest pair, waiting for one; None once the slot is closed and empty."""
+        with self._changed:
+            self._changed.wait_for(lambda: self._arrival is not None or self._closed)
+            arrival, self._arrival = self._arrival, None
+            if arrival is None or not self.overwritten:
+                return arrival
+            return Arrival(arrival.pair, {**arrival.dropped, DropReason.OVERWRITTEN: self.overwritten})
+
+    def close(self, failure: BaseException | None = None) -> None:
+        """No pair follows; `failure` says why where it is not the source's end."""
+        with self._changed:
+            self._closed, self.failure = True, failure
+            self._changed.notify()
+
+
+def _calibration(rig: Rig) -> WireCalibration:
+    calibrated_at = rig.calibration.calibrated_at
+    age_days = None if calibrated_at is None else (datetime.now(UTC) - calibrated_at).total_seconds() / 86_400
+    return WireCalibration(
+        calibrated_at=None if calibrated_at is None else calibrated_at.isoformat(),
+        age_days=None if age_days is None else round(age_days, 2),
+        reprojection_rms_px=rig.calibration.reprojection_rms_px,
+    )

@@ -1,0 +1,152 @@
+"""A run as the person at a terminal sees and ends it: progress, warnings, Ctrl-C, summary."""
+
+import logging
+import signal
+import threading
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import replace
+from logging.handlers import MemoryHandler
+from pathlib import Path
+from types import FrameType, TracebackType
+from typing import Self
+
+import numpy as np
+from pydantic import TypeAdapter
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+from needletrack.errors import RecordingError
+from needletrack.publish.message import TrackMessage
+from needletrack.records import DropReason, NeedleTrack, Status, StereoPair
+from needletrack.service import RunSummary
+from needletrack.watch import WatchSummary
+
+_MOST_REASONS = 4
+_SUMMARY = TypeAdapter(WatchSummary)
+
+
+class Interruption:
+    """Sets `stop` on the first Ctrl-C or SIGTERM; the next one ends the program at once."""
+
+    def __init__(self) -> None:
+        self.stop = threading.Event()
+        self._signal: int | None = None
+
+    @property
+    def exit_code(self) -> int:
+        """0, or 128 + the signal that came, as a shell says it: 130 for Ctrl-C."""
+        return 0 if self._signal is None else 128 + self._signal
+
+    def __enter__(self) -> Self:
+        self._before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+        for number in self._before:
+            signal.signal(number, self._on_signal)
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._restore()
+
+    def _on_signal(self, number: int, frame: FrameType | None) -> None:
+        self._signal = number
+        self._restore()
+        self.stop.set()
+
+    def _restore(self) -> None:
+        for number, handler in self._before.items():
+            signal.signal(number, handler)
+
+
+class ProgressBar:
+    """A sink that draws how far a replay has come; draws nothing where the console is no terminal.
+
+    first: the first pair's sequence number; total: pairs to be played.
+    """
+
+    def __init__(self, console: Console, first: int, total: int) -> None:
+        columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+        # Not console.is_terminal, which FORCE_COLOR makes true of a pipe.
+        hidden = not console.file.isatty()
+        self._progress = Progress(*columns, console=console, transient=True, disable=hidden)
+        self._task = self._progress.add_task("", total=total)
+        self._first = first
+
+    def take(self, pair: StereoPair, track: NeedleTrack, message: TrackMessage) -> None:
+        """One more pair is done, and those before it are done or lost."""
+        done = pair.sequence - self._first + 1
+        self._progress.update(self._task, completed=done, description=f"{track.status.value:8}")
+
+    def __enter__(self) -> Self:
+        self._progress.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._progress.stop()
+
+
+@contextmanager
+def warnings_shown(console: Console, *, at_end: bool = False) -> Iterator[None]:
+    """What the package logs within it, on the console; at_end: not before it ends."""
+    handler: logging.Handler = _ConsoleHandler(console)
+    if at_end:
+        # Never flushed by a record's level; closing it flushes.
+        handler = MemoryHandler(10_000, flushLevel=logging.CRITICAL + 1, target=handler)
+    logger = logging.getLogger("needletrack")
+    logger.addHandler(handler)
+    try:
+        yield
+    finally:
+        logger.removeHandler(handler)
+        handler.close()
+
+
+def described(summary: RunSummary) -> str:
+    """A run's summary in a few lines."""
+    rate_hz = summary.pairs / summary.duration_s if summary.duration_s > 0 else 0.0
+    first = f"{summary.pairs} pairs in {summary.duration_s:.1f} s, {rate_hz:.1f} a second"
+    if summary.tracking_ms:
+        p50, p99 = np.percentile(summary.tracking_ms, [50, 99])
+        first += f"; tracking p50 {p50:.1f} ms, p99 {p99:.1f} ms"
+    return "\n".join((first, f"  {statuses_text(summary)}", f"  dropped: {counted(summary.dropped) or 'none'}"))
+
+
+def statuses_text(summary: RunSummary) -> str:
+    """`ok 20, degraded 3, invalid 1 (tip_not_seen 3, no_candidate 1)`: the most frequent reasons."""
+    statuses = ", ".join(f"{status.value} {summary.statuses.get(status, 0)}" for status in Status)
+    most = sorted(summary.reasons.items(), key=lambda entry: -entry[1])
+    more = f", and {len(most) - _MOST_REASONS} more" if len(most) > _MOST_REASONS else ""
+    return statuses + (f" ({counted(dict(most[:_MOST_REASONS]))}{more})" if most else "")
+
+
+def counted(counts: Mapping[DropReason, int] | Mapping[str, int]) -> str:
+    """`overwritten 12, unpaired_left 1`, the most frequent first."""
+    return ", ".join(f"{name} {count}" for name, count in sorted(counts.items(), key=lambda entry: -entry[1]))
+
+
+def write_summary(summary: WatchSummary, path: Path) -> None:
+    """Write what was received as JSON; raises RecordingError where the file cannot be written."""
+    # pydantic knows no read-only mapping.
+    plain = replace(summary, statuses=dict(summary.statuses))
+    try:
+        path.write_bytes(_SUMMARY.dump_json(plain, indent=2) + b"\n")
+    except OSError as error:
+        raise RecordingError(f"{path}: the summary cannot be written: {error.strerror or error}") from error
+
+
+def read_summary(path: Path) -> WatchSummary:
+    """What `write_summary` wrote."""
+    return _SUMMARY.validate_json(path.read_bytes())
+
+
+class _ConsoleHandler(logging.Handler):
+    def __init__(self, console: Console) -> None:
+        super().__init__()
+        self._console = console
+
+    def emit(self, record: logging.LogRecord) -> None:
+        text = f"{record.levelname.lower()}: {record.getMessage()}"
+        self._console.print(text, markup=False, highlight=False, soft_wrap=True)

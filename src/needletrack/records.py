@@ -102,7 +102,7 @@ REASON_MEANING: Mapping[Reason, str] = MappingProxyType(
         Reason.ALONG_EPIPOLAR_LINES: "A long stretch runs along the epipolar lines, where two views fix no depth.",
         Reason.HIGH_RESIDUAL: "The fitted curve does not reproject onto what the images show.",
         Reason.HIGH_UNCERTAINTY: "The stated standard deviation exceeds what a controller may act on.",
-        Reason.TIP_NOT_SEEN: "The free end was not found in both views.",
+        Reason.TIP_NOT_SEEN: "The free end was not found in both views, or something hides it: no tip is given.",
         Reason.TIP_DISAGREES: "The two views place the free end at different points.",
         Reason.JUMP: "The shape moved further since the last pair than a needle can.",
         Reason.REFERENCE_METHOD: "Found by the 2017 reference method, which cannot tell whether it is right.",
@@ -255,7 +255,7 @@ class Quality:
     """How well the shape explains the images; None where there is nothing to measure.
 
     reprojection_rms_px: of the observations across the projected axis, both views.
-    epipolar_rms_px: of independently found ends (tip, base) against their epipolar lines.
+    epipolar_rms_px: of the tip, found in each view alone, against its epipolar line.
     coverage: share of the shape's length that both cameras see.
     """
 

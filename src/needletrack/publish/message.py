@@ -163,7 +163,7 @@ class WireQuality(WirePart):
         description="of the observations across the projected axis, both views"
     )
     epipolar_rms_px: NotNegative | None = Field(
-        description="of independently found ends (tip, base) against their epipolar lines"
+        description="of the tip, found in each view alone, against its epipolar line"
     )
     coverage: Annotated[float, Field(ge=0, le=1)] | None = Field(
         description="share of the shape's length that both cameras see"

@@ -10,7 +10,7 @@ from needletrack.errors import NeedleNotFound
 from needletrack.geometry.epipolar import epipolar_lines
 from needletrack.geometry.spline import tangents
 from needletrack.geometry.stereo import StereoRig
-from needletrack.records import Float, NeedleCurve, NeedleTrack, Reason, Status
+from needletrack.records import Float, NeedleCurve, NeedleTrack, Quality, Reason, Status
 from needletrack.tracking.match import inside
 from needletrack.tracking.needle import Needle, Positive, Workspace
 from needletrack.tracking.refine import Refined
@@ -61,8 +61,7 @@ _NOT_A_NEEDLE = (Reason.OUTSIDE_WORKSPACE, Reason.TOO_SHORT, Reason.TOO_LONG, Re
 def weaknesses(
     refined: Refined,
     curve: NeedleCurve,
-    coverage: float,
-    tip_epipolar_px: float,
+    quality: Quality,
     rig: StereoRig,
     needle: Needle,
     workspace: Workspace,
@@ -82,7 +81,7 @@ def weaknesses(
         <= refined.diameter_mm
         <= needle.max_diameter_mm + _SATURATION_MM,
         Reason.AMBIGUOUS_BASE: not refined.base_is_known,
-        Reason.LOW_COVERAGE: coverage < parameters.min_coverage,
+        Reason.LOW_COVERAGE: (quality.coverage or 0.0) < parameters.min_coverage,
         Reason.ALONG_EPIPOLAR_LINES: _share_along_epipolar_lines(curve.points_mm, rig, parameters.epipolar_angle_deg)
         > parameters.max_epipolar_share,
         Reason.HIGH_RESIDUAL: refined.fit.rms_px > parameters.max_reprojection_rms_px,
@@ -90,7 +89,7 @@ def weaknesses(
         or max(tip.sigma_mm) > parameters.max_sigma_mm,
         Reason.TIP_NOT_SEEN: min(tip.contrast) < parameters.min_tip_contrast or not tip.is_free,
         Reason.TIP_DISAGREES: abs(tip.each_mm[0] - tip.each_mm[1]) > parameters.max_tip_disagreement_mm
-        or tip_epipolar_px > parameters.max_tip_epipolar_px,
+        or (quality.epipolar_rms_px or 0.0) > parameters.max_tip_epipolar_px,
         Reason.JUMP: previous is not None
         and previous.status is Status.OK
         and previous.tip is not None

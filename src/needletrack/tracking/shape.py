@@ -1,0 +1,125 @@
+"""A refined curve with its verdict, and the track that is published of it."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from needletrack.geometry.epipolar import sampson_distance_px
+from needletrack.geometry.spline import arc_length, curvature, unit
+from needletrack.geometry.stereo import StereoRig
+from needletrack.geometry.transform import orientation_along
+from needletrack.records import (
+    BasePose,
+    Evidence,
+    Float,
+    NeedleCurve,
+    NeedleTrack,
+    Quality,
+    Reason,
+    Status,
+    TipPose,
+)
+from needletrack.tracking.fit import CurveFit
+from needletrack.tracking.gates import weaknesses
+from needletrack.tracking.parameters import TrackingParameters
+from needletrack.tracking.refine import Refined
+
+_SAME_SHAPE_MM = 2.0
+_MAX_VELOCITY_INTERVAL_NS = 250_000_000
+
+
+@dataclass(frozen=True, slots=True)
+class Shape:
+    """A shape and why it is not ok (empty where it is); support_mm is the length that the views show, both added."""
+
+    refined: Refined
+    curve: NeedleCurve
+    quality: Quality
+    support_mm: float
+    reasons: tuple[Reason, ...]
+
+
+def judged(refined: Refined, rig: StereoRig, parameters: TrackingParameters, previous: NeedleTrack | None) -> Shape:
+    """The refined curve as a shape with its verdict; raises NeedleNotFound where it cannot be the needle."""
+    fit = refined.fit
+    seen = np.stack([view.seen for view in refined.observed])
+    curve = NeedleCurve(
+        fit.points_mm,
+        _sigma_across_mm(fit),
+        seen.sum(axis=0),
+        curvature(fit.derivative(1), fit.derivative(2)),
+        float(arc_length(fit.points_mm)[-1]),
+    )
+    left_px = rig.left.undistort(refined.tip_px[[0]])
+    right_px = rig.right.undistort(refined.tip_px[[1]])
+    quality = Quality(
+        fit.rms_px,
+        float(sampson_distance_px(rig.fundamental, left_px, right_px)[0]),
+        float(seen.all(axis=0).mean()),
+    )
+    support_mm = float(sum(view.firm.mean() for view in refined.observed)) * curve.length_mm
+    reasons = weaknesses(
+        refined, curve, quality, rig, parameters.needle, parameters.workspace, parameters.gates, previous
+    )
+    return Shape(refined, curve, quality, support_mm, reasons)
+
+
+def differ(shape: Shape, other: Shape) -> bool:
+    """Whether two shapes are different ones, and not two fits of one needle."""
+    apart = np.linalg.norm(shape.curve.points_mm[:, None] - other.curve.points_mm[None], axis=2).min(axis=1)
+    return float(np.median(apart)) > _SAME_SHAPE_MM
+
+
+def as_track(
+    shape: Shape,
+    captured_at_ns: int,
+    previous: NeedleTrack | None,
+    since_detection: int,
+    evidence: Evidence,
+    elapsed_ms: dict[str, float],
+) -> NeedleTrack:
+    """The track to publish: without a tip where the free end was not found, for a curve's end is not yet a tip."""
+    fit, points_mm = shape.refined.fit, shape.curve.points_mm
+    along = unit(fit.derivative(1)[[0, -1]])
+    tip = None
+    if Reason.TIP_NOT_SEEN not in shape.reasons:
+        across = fit.point_covariance_mm2()[-1]
+        covariance_mm2 = across + max(shape.refined.tip.sigma_mm) ** 2 * np.outer(along[1], along[1])
+        tip = TipPose(
+            points_mm[-1],
+            along[1],
+            orientation_along(along[1]),
+            (covariance_mm2 + covariance_mm2.T) / 2,
+            _velocity_mm_s(points_mm[-1], captured_at_ns, previous),
+            int(shape.curve.seen[-1]),
+        )
+    return NeedleTrack(
+        captured_at_ns,
+        Status.DEGRADED if shape.reasons else Status.OK,
+        shape.reasons,
+        shape.curve,
+        tip,
+        BasePose(points_mm[0], along[0]),
+        shape.refined.diameter_mm,
+        since_detection,
+        shape.quality,
+        elapsed_ms,
+        evidence,
+    )
+
+
+def _sigma_across_mm(fit: CurveFit) -> Float:
+    """Square root (N,) of the larger eigenvalue of each point's covariance across the tangent."""
+    along = unit(fit.derivative(1))
+    across = np.eye(3) - along[:, :, None] * along[:, None, :]
+    flattened = across @ fit.point_covariance_mm2() @ across
+    return np.asarray(np.sqrt(np.maximum(np.linalg.eigvalsh(flattened)[:, -1], 1e-12)))
+
+
+def _velocity_mm_s(tip_mm: Float, captured_at_ns: int, previous: NeedleTrack | None) -> Float | None:
+    if previous is None or previous.tip is None or previous.status is not Status.OK:
+        return None
+    elapsed_ns = captured_at_ns - previous.captured_at_ns
+    if not 0 < elapsed_ns <= _MAX_VELOCITY_INTERVAL_NS:
+        return None
+    return np.asarray((tip_mm - previous.tip.position_mm) / (elapsed_ns * 1e-9))

@@ -22,7 +22,7 @@ _RIVAL_SHARE = 0.4
 # A weak track is searched for anew once in so many pairs, sooner where its shape is in doubt; one that holds is not.
 _PAIRS_PER_SEARCH = 30
 _PAIRS_PER_SEARCH_IN_DOUBT = 10
-_IN_DOUBT = {Reason.AMBIGUOUS_BASE, Reason.LOW_COVERAGE, Reason.HIGH_RESIDUAL, Reason.TIP_NOT_SEEN}
+_IN_DOUBT = {Reason.AMBIGUOUS_BASE, Reason.LOW_COVERAGE, Reason.HIGH_RESIDUAL}
 
 
 def track(

@@ -98,11 +98,8 @@ def refine(
     base from tip where no sleeve is seen.
     """
     spacing = models.refine.spacing_mm
-    points, diameter_mm = _follow(images, rig, points_mm, models, max_rounds)
-    extended, observed = _observe_extended(images, rig, points, diameter_mm, models)
-    stretch = needle_stretch(observed, spacing, models.ends)
-    if stretch.stop - stretch.start < 2:
-        raise NeedleNotFound("refine", Reason.LOW_COVERAGE)
+    followed = _follow(images, rig, points_mm, models, max_rounds)
+    extended, observed, stretch = followed.extended_mm, followed.observed, followed.stretch
     if stretch.sleeve is not None:
         base: int | None = 0 if stretch.sleeve.index == stretch.start else -1
     else:
@@ -117,7 +114,7 @@ def refine(
         raise NeedleNotFound("refine", Reason.TOO_SHORT)
     # The final curve ends at the tip itself; its last points are held by the taper's edges and the spline's stiffness.
     visible = _cut(extended, float(arc[stretch.start]), tip.at_mm, spacing)
-    observed = _observe(images, rig, visible, diameter_mm, models)
+    observed = _observe(images, rig, visible, followed.diameter_mm, models)
     left_end, right_end = (
         _tip_observation(view, each - tip.at_mm, sigma, spacing)
         for view, each, sigma in zip(observed, tip.each_mm, tip.sigma_mm, strict=True)
@@ -125,7 +122,7 @@ def refine(
     fit = fit_curve(visible, observed, rig, models.fit, ((left_end,), (right_end,)))
     tip_px = np.stack([_tip_px(view, end) for view, end in zip(observed, (left_end, right_end), strict=True)])
     seen_diameter_mm = _diameter_mm(observed, rig, visible)
-    return Refined(fit, observed, seen_diameter_mm or diameter_mm, base is not None, tip, tip_px)
+    return Refined(fit, observed, seen_diameter_mm or followed.diameter_mm, base is not None, tip, tip_px)
 
 
 def _tip_observation(view: AxisObservations, ahead_mm: float, sigma_mm: float, spacing_mm: float) -> EndObservation:
@@ -139,10 +136,18 @@ def _tip_px(view: AxisObservations, end: EndObservation) -> Float:
     return np.asarray(view.center_px[-1] + view.offset_px[-1] * normal + end.shift_px * along)
 
 
-def _follow(
-    images: Images, rig: StereoRig, points_mm: Float, models: RefineModels, max_rounds: int
-) -> tuple[Float, float]:
-    """Observe, fit and lengthen until it grows no more; the curve (N, 3) and the needle's diameter."""
+@dataclass(frozen=True, slots=True)
+class _Followed:
+    """A curve that runs on past both ends of the needle, what the views show across it, and the needle's part of it."""
+
+    extended_mm: Float
+    observed: Observed
+    stretch: Stretch
+    diameter_mm: float
+
+
+def _follow(images: Images, rig: StereoRig, points_mm: Float, models: RefineModels, max_rounds: int) -> _Followed:
+    """Observe, and fit and lengthen, until the needle's part grows no more."""
     spacing = models.refine.spacing_mm
     points, longest_mm = points_mm, 0.0
     diameter_mm: float | None = None
@@ -151,20 +156,21 @@ def _follow(
         stretch = needle_stretch(observed, spacing, models.ends)
         start, stop = stretch.start, stretch.stop
         part = (observed[0].part(start, stop), observed[1].part(start, stop))
-        seen_mm = _diameter_mm(part, rig, extended[start:stop])
-        if seen_mm is None or (stop - start) * spacing < models.needle.min_length_mm / 2:
+        diameter_mm = _diameter_mm(part, rig, extended[start:stop])
+        length_mm = (stop - start) * spacing
+        if diameter_mm is None or length_mm < models.needle.min_length_mm / 2:
             raise NeedleNotFound("refine", Reason.LOW_COVERAGE)
-        diameter_mm = seen_mm
-        fit = fit_curve(extended[start:stop], part, rig, models.fit, hold_mm=models.refine.hold_mm)
-        points = _sampled(fit, spacing)
-        length_mm = float(arc_length(points)[-1])
-        if length_mm < models.needle.min_length_mm / 2:
-            raise NeedleNotFound("refine", Reason.TOO_SHORT)
         if length_mm > 2 * models.needle.max_length_mm:
             raise NeedleNotFound("refine", Reason.TOO_LONG)
-        if remaining == 0 or 0 < length_mm <= longest_mm + models.refine.settled_mm:
-            return points, diameter_mm
+        # From a detection two fits settle the curve; from the pair before it is settled.
+        has_settled = max_rounds - remaining > 2 and length_mm <= longest_mm + models.refine.settled_mm
+        if remaining == 0 or has_settled:
+            return _Followed(extended, observed, stretch, diameter_mm)
         longest_mm = max(longest_mm, length_mm)
+        fit = fit_curve(extended[start:stop], part, rig, models.fit, hold_mm=models.refine.hold_mm)
+        points = _sampled(fit, spacing)
+        if arc_length(points)[-1] < models.needle.min_length_mm / 2:
+            raise NeedleNotFound("refine", Reason.TOO_SHORT)
     raise ValueError("max_rounds must be one or more")
 
 

@@ -76,8 +76,8 @@ def _line_responses(image: Gray, sigmas_px: tuple[float, ...]) -> tuple[Gray, Gr
         size = np.abs(mean)
         strength = size + spread
         strength *= (3 * size > spread) & (size < 3 * spread)
-        np.maximum(bright, strength, out=bright, where=mean < 0)
-        np.maximum(dark, strength, out=dark, where=mean > 0)
+        np.maximum(bright, strength * (mean < 0), out=bright)
+        np.maximum(dark, strength * (mean > 0), out=dark)
     for response in (bright, dark):
         response[[0, -1]] = 0
         response[:, [0, -1]] = 0
@@ -88,9 +88,7 @@ def _without_side_lobes(bright: Gray, dark: Gray) -> tuple[Gray, Gray]:
     # Beside a line of one polarity the second derivative has lobes of the other, 0.45 of its height (Gaussian profile).
     reach = np.ones((9, 9), np.uint8)
     share = np.float32(0.6)
-    bright_mask = cv2.compare(bright, cv2.dilate(dark, reach) * share, cv2.CMP_GT)
-    dark_mask = cv2.compare(dark, cv2.dilate(bright, reach) * share, cv2.CMP_GT)
-    return np.where(bright_mask > 0, bright, np.float32(0)), np.where(dark_mask > 0, dark, np.float32(0))
+    return bright * (bright > share * cv2.dilate(dark, reach)), dark * (dark > share * cv2.dilate(bright, reach))
 
 
 def _hysteresis(response: Gray, parameters: SegmentParameters) -> Mask:

@@ -1,6 +1,7 @@
 # The needletrack daemon.
 #   docker build --tag needletrack .
-#   docker run --device /dev/video0 --device /dev/video2 --network host --volume "$PWD/config:/config:ro" needletrack run --help
+#   docker run --network host --volume "$PWD/recordings:/recordings:ro" needletrack \
+#       replay /recordings/steer-b --paced --loop 100 --publish tcp/127.0.0.1:7447
 FROM python:3.11-slim-bookworm AS build
 
 # The pinned packages change seldom and keep a layer of their own.

@@ -50,9 +50,7 @@ class RefineParameters(BaseModel):
         15, ge=2, description="Rounds of observing and fitting after a detection, each of which may lengthen the curve."
     )
     max_tracking_rounds: int = Field(
-        2,
-        ge=1,
-        description="Rounds from the track of the pair before: between two pairs a needle moves and grows little.",
+        6, ge=2, description="Rounds from the track of the pair before; two suffice where the needle moved little."
     )
 
 
@@ -89,16 +87,17 @@ def refine(
     rig: StereoRig,
     points_mm: Float,
     models: RefineModels,
-    max_rounds: int,
+    *,
+    is_track: bool = False,
     previous_base_mm: Float | None = None,
 ) -> Refined:
-    """Follow the needle from a rough curve (N, 3) in space; raises NeedleNotFound where the views do not show it.
+    """Follow the needle from a curve (N, 3) in space; raises NeedleNotFound where the views do not show it.
 
-    Each of at most max_rounds rounds lengthens the curve by up to reach_mm at both ends. previous_base_mm (3,) tells
+    is_track: the curve is the pair before's, and nearly right; otherwise it is a rough one. previous_base_mm (3,) tells
     base from tip where no sleeve is seen.
     """
     spacing = models.refine.spacing_mm
-    followed = _follow(images, rig, points_mm, models, max_rounds)
+    followed = _follow(images, rig, points_mm, models, is_track)
     extended, observed, stretch = followed.extended_mm, followed.observed, followed.stretch
     if stretch.sleeve is not None:
         base: int | None = 0 if stretch.sleeve.index == stretch.start else -1
@@ -146,8 +145,15 @@ class _Followed:
     diameter_mm: float
 
 
-def _follow(images: Images, rig: StereoRig, points_mm: Float, models: RefineModels, max_rounds: int) -> _Followed:
-    """Observe, and fit and lengthen, until the needle's part grows no more."""
+def _follow(images: Images, rig: StereoRig, points_mm: Float, models: RefineModels, is_track: bool) -> _Followed:
+    """Observe, and fit and lengthen, until the needle's part grows no more.
+
+    A detected curve needs two fits to settle. The track of the pair before needs one, and is done with as soon as it
+    has its length again: where the needle has moved sideways, its far end comes into reach round by round.
+    """
+    max_rounds = models.refine.max_tracking_rounds if is_track else models.refine.max_rounds
+    min_rounds = 2 if is_track else 3
+    needed_mm = float(arc_length(points_mm)[-1]) if is_track else np.inf
     spacing = models.refine.spacing_mm
     points, longest_mm = points_mm, 0.0
     diameter_mm: float | None = None
@@ -162,9 +168,9 @@ def _follow(images: Images, rig: StereoRig, points_mm: Float, models: RefineMode
             raise NeedleNotFound("refine", Reason.LOW_COVERAGE)
         if length_mm > 2 * models.needle.max_length_mm:
             raise NeedleNotFound("refine", Reason.TOO_LONG)
-        # From a detection two fits settle the curve; from the pair before it is settled.
-        has_settled = max_rounds - remaining > 2 and length_mm <= longest_mm + models.refine.settled_mm
-        if remaining == 0 or has_settled:
+        grows = length_mm > longest_mm + models.refine.settled_mm
+        is_whole = length_mm > needed_mm - models.refine.settled_mm
+        if remaining == 0 or (max_rounds - remaining >= min_rounds and (is_whole or not grows)):
             return _Followed(extended, observed, stretch, diameter_mm)
         longest_mm = max(longest_mm, length_mm)
         fit = fit_curve(extended[start:stop], part, rig, models.fit, hold_mm=models.refine.hold_mm)

@@ -76,10 +76,10 @@ def _followed(
     if previous is None or previous.curve is None:
         return None
     base_mm = None if previous.base is None else previous.base.position_mm
-    rounds = parameters.refine.max_tracking_rounds
     try:
         with stopwatch("refine"):
-            refined = refine(images, rig, previous.curve.points_mm, _models(parameters), rounds, base_mm)
+            points_mm = previous.curve.points_mm
+            refined = refine(images, rig, points_mm, _models(parameters), is_track=True, previous_base_mm=base_mm)
             shape = judged(refined, rig, parameters, previous)
     except NeedleNotFound:
         # Lost is not yet gone: the search that follows decides, and its reason is the one that is told.
@@ -108,7 +108,7 @@ def _searched(
                 rough_mm = initial_curve(
                     candidate.points_mm, candidate.confidence, parameters.refine.spacing_mm, parameters.fit
                 )
-                refined = refine(images, rig, rough_mm, _models(parameters), parameters.refine.max_rounds)
+                refined = refine(images, rig, rough_mm, _models(parameters))
                 found.append((judged(refined, rig, parameters, previous), candidate))
         except NeedleNotFound as error:
             lost.append(error)

@@ -24,6 +24,8 @@ _SLEEVE_SHARE = 0.7
 _CROSSED_MM = 2.0
 # Between two pairs the base moves less than this.
 _BASE_MOTION_MM = 8.0
+# How much of the curve around a rough end tells where the tip is.
+TIP_BEFORE_MM, TIP_BEYOND_MM = 7.0, 4.0
 # Lengths of taper that are tried for the tip, mm: blunt or round ends, and cones. What is between them is blur.
 _TAPERS_MM = np.array([0.2, 0.4, 1.5, 2.0, 2.5, 3.0, 3.5])
 # A taper whose residual is at most so many times the best one's is a rival of it.
@@ -191,7 +193,7 @@ def find_tip(
     is the sigma by which the observations were averaged along the curve; the lens adds its blur, which a needle turned
     towards the camera spreads over more of its length.
     """
-    near = (arc_mm >= end_mm - 7.0) & (arc_mm <= end_mm + 4.0)
+    near = (arc_mm >= end_mm - TIP_BEFORE_MM) & (arc_mm <= end_mm + TIP_BEYOND_MM)
     s = arc_mm[near]
     tips = np.arange(end_mm - 2.0, end_mm + 3.5, 0.05)
     # Shape of the signal: 1 on the shaft, falling to 0 at the apex; (tapers, tips, stations).

@@ -15,6 +15,8 @@ from needletrack.geometry.stereo import StereoRig
 from needletrack.records import Float, Image, Reason
 from needletrack.tracking.axis import AxisObservations, AxisParameters, observe_axis
 from needletrack.tracking.ends import (
+    TIP_BEFORE_MM,
+    TIP_BEYOND_MM,
     EndsParameters,
     Observed,
     Stretch,
@@ -39,7 +41,10 @@ class RefineParameters(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    spacing_mm: Positive = Field(0.4, description="Spacing of the cross sections along the needle, mm.")
+    spacing_mm: Positive = Field(0.4, description="Spacing of the points of the published centerline, mm.")
+    follow_spacing_mm: Positive = Field(
+        0.8, description="Spacing of the cross sections while the needle is followed, mm."
+    )
     reach_mm: Positive = Field(8.0, description="The curve is followed this far beyond its ends in one round, mm.")
     hold_mm: Positive = Field(
         1.0,
@@ -96,7 +101,6 @@ def refine(
     is_track: the curve is the pair before's, and nearly right; otherwise it is a rough one. previous_base_mm (3,) tells
     base from tip where no sleeve is seen.
     """
-    spacing = models.refine.spacing_mm
     followed = _follow(images, rig, points_mm, models, is_track)
     extended, observed, stretch = followed.extended_mm, followed.observed, followed.stretch
     if stretch.sleeve is not None:
@@ -108,7 +112,14 @@ def refine(
         extended, observed = extended[::-1], (observed[0].turned(), observed[1].turned())
         stretch = Stretch(len(extended) - stretch.stop, len(extended) - stretch.start, stretch.sleeve)
     arc = arc_length(extended)
-    tip = find_tip(observed, arc, float(arc[stretch.stop - 1]), models.axis.smooth_along_mm, models.ends)
+    # What was followed coarsely is looked at closely where the tip is.
+    spacing = models.refine.spacing_mm
+    rough_end_mm = float(arc[stretch.stop - 1])
+    near_mm = (max(0.0, rough_end_mm - TIP_BEFORE_MM), min(float(arc[-1]), rough_end_mm + TIP_BEYOND_MM))
+    end = _cut(extended, *near_mm, spacing)
+    end_observed = _observe(images, rig, end, followed.diameter_mm, models)
+    end_arc = np.linspace(*near_mm, len(end))
+    tip = find_tip(end_observed, end_arc, rough_end_mm, models.axis.smooth_along_mm, models.ends)
     if tip.at_mm - arc[stretch.start] < models.needle.min_length_mm / 2:
         raise NeedleNotFound("refine", Reason.TOO_SHORT)
     # The final curve ends at the tip itself; its last points are held by the taper's edges and the spline's stiffness.
@@ -154,7 +165,7 @@ def _follow(images: Images, rig: StereoRig, points_mm: Float, models: RefineMode
     max_rounds = models.refine.max_tracking_rounds if is_track else models.refine.max_rounds
     min_rounds = 2 if is_track else 3
     needed_mm = float(arc_length(points_mm)[-1]) if is_track else np.inf
-    spacing = models.refine.spacing_mm
+    spacing = models.refine.follow_spacing_mm
     points, longest_mm = points_mm, 0.0
     diameter_mm: float | None = None
     for remaining in reversed(range(max_rounds)):
@@ -183,7 +194,7 @@ def _follow(images: Images, rig: StereoRig, points_mm: Float, models: RefineMode
 def _observe_extended(
     images: Images, rig: StereoRig, points_mm: Float, diameter_mm: float | None, models: RefineModels
 ) -> tuple[Float, Observed]:
-    extended = _extended(points_mm, models.refine.reach_mm, models.refine.spacing_mm)
+    extended = _extended(points_mm, models.refine.reach_mm, models.refine.follow_spacing_mm)
     return extended, _observe(images, rig, extended, diameter_mm, models)
 
 

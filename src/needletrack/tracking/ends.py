@@ -21,6 +21,8 @@ _MIN_DENSITY = 0.42
 # An edge is blurred over about this much of the curve.
 _EDGE_GAP_MM = 0.5
 _SLEEVE_SHARE = 0.7
+# A sleeve's highlight is a faint line beside the needle's own, which a vessel behind the needle does not end.
+_MAX_LINE_IN_SLEEVE = 0.4
 _CROSSED_MM = 2.0
 # Between two pairs the base moves less than this.
 _BASE_MOTION_MM = 8.0
@@ -121,20 +123,23 @@ def find_sleeve_edge(
     while weakest.size and weakest.max() >= parameters.sleeve_step_gray:
         index = int(np.argmax(weakest))
         outward = 1 if firm[:index].sum() > firm[index:].sum() else -1
-        if _stays_changed(observed, index, outward, spacing_mm, parameters):
+        if _is_sleeve(observed, index, outward, spacing_mm, parameters):
             return SleeveEdge(index, float(weakest[index]))
         weakest[max(0, index - reach) : index + reach + 1] = 0.0
     return None
 
 
-def _stays_changed(observed: Observed, index: int, outward: int, spacing_mm: float, parameters: EndsParameters) -> bool:
-    """Whether both flanks of both views keep their change over the least length of a sleeve, as far as it is seen."""
+def _is_sleeve(observed: Observed, index: int, outward: int, spacing_mm: float, parameters: EndsParameters) -> bool:
+    """Whether both flanks of both views stay changed over the least length of a sleeve, and the needle ends there."""
     gap, near = round(_EDGE_GAP_MM / spacing_mm), round(parameters.sleeve_step_mm / spacing_mm)
     far = round(parameters.min_sleeve_mm / spacing_mm)
     at = np.arange(observed[0].flank_gray.shape[1])
     inward = (outward * (index - at) > gap) & (outward * (index - at) <= gap + near)
     beyond = (outward * (at - index) > gap) & (outward * (at - index) <= far)
     if not inward.any() or beyond.sum() < near:
+        return False
+    lines = [view.signals_gray_px[1] for view in observed]
+    if np.mean([np.median(line[beyond]) / max(np.median(line[inward]), 1e-6) for line in lines]) > _MAX_LINE_IN_SLEEVE:
         return False
     for view in observed:
         change = view.flank_gray[:, beyond] - view.flank_gray[:, inward].mean(axis=1, keepdims=True)

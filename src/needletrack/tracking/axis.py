@@ -33,8 +33,9 @@ Mask = npt.NDArray[np.bool_]
 _ACROSS_STEP_PX = 0.5
 # An edge without its partner is believed only this near to where it should be.
 _ONE_EDGE_PX = 1.5
-# Standard deviation of a uniform distribution of width 1: an axis that may lie anywhere in a width.
-_UNIFORM_SIGMA = 1 / np.sqrt(12)
+# A streak may lie anywhere within the needle's width, which is a sigma of 0.29 of what is missing; but it keeps to its
+# side all along the needle, and what does not average out counts for more.
+_STREAK_SIGMA = 0.4
 
 
 class AxisParameters(BaseModel):
@@ -165,7 +166,7 @@ def observe_axis(
     line = find_line(strip, offsets, middle_width, search_px, parameters.line_height_gray)
     line_fits = line.found & (line.width_px < parameters.max_width_share * width + 0.5)
     offset, sigma, seen_width = _from_edges(silhouette, line, line_fits, width, known, parameters)
-    line_sigma = np.hypot(2 * parameters.edge_sigma_px, np.maximum(width - line.width_px, 0.0) * _UNIFORM_SIGMA)
+    line_sigma = np.hypot(2 * parameters.edge_sigma_px, np.maximum(width - line.width_px, 0.0) * _STREAK_SIGMA)
     by_line = line_fits & ~(sigma < line_sigma)
     offset, sigma = np.where(by_line, line.middle_px, offset), np.where(by_line, line_sigma, sigma)
     sigma = np.where(camera.contains(center, margin_px=1.0) & (np.abs(offset) <= search_px), sigma, np.inf)
@@ -202,7 +203,7 @@ def _from_edges(
         missing = np.maximum(width - seen_width, 0.0)
         both = missing < (1 - parameters.min_width_share) * width
         both &= seen_width < width * parameters.max_width_share + 0.5
-        variance = variance + np.where(missing > parameters.width_slack_px, missing * _UNIFORM_SIGMA, 0.0) ** 2
+        variance = variance + np.where(missing > parameters.width_slack_px, missing * _STREAK_SIGMA, 0.0) ** 2
     else:
         both = (seen_width > 1.0) & (seen_width < width + 2.0)
     sigma = np.where(both, np.sqrt(variance), np.inf)

@@ -52,7 +52,7 @@ class EndsParameters(BaseModel):
         description="The sleeve differs from what is beside the needle, on both sides in both views, by this, grey.",
     )
     min_sleeve_mm: Positive = Field(
-        6.0, description="A sleeve is at least so long: what is shorter crosses the needle, mm."
+        8.0, description="A sleeve is at least so long: what is shorter crosses the needle, mm."
     )
     sleeve_step_mm: Positive = Field(2.5, description="Length of needle and of sleeve that are compared, mm.")
 

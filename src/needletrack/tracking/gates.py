@@ -86,7 +86,7 @@ def weaknesses(
         > parameters.max_epipolar_share,
         Reason.HIGH_RESIDUAL: refined.fit.rms_px > parameters.max_reprojection_rms_px,
         Reason.HIGH_UNCERTAINTY: float(np.percentile(curve.sigma_mm, 95)) > parameters.max_sigma_mm
-        or max(tip.sigma_mm) > parameters.max_sigma_mm,
+        or float(np.sqrt(np.linalg.eigvalsh(refined.tip_covariance_mm2)[-1])) > parameters.max_sigma_mm,
         Reason.TIP_NOT_SEEN: min(tip.contrast) < parameters.min_tip_contrast or not tip.is_free,
         Reason.TIP_DISAGREES: abs(tip.each_mm[0] - tip.each_mm[1]) > parameters.max_tip_disagreement_mm
         or (quality.epipolar_rms_px or 0.0) > parameters.max_tip_epipolar_px,

@@ -72,15 +72,16 @@ def match_lines(
         raise NeedleNotFound("match", Reason.NO_CANDIDATE)
     left_px = [_resampled(line, rig.left, parameters.step_px) for line in left]
     right_px = [_resampled(line, rig.right, parameters.step_px) for line in right]
+    pairs = _exclusive_pairs(left_px, right_px, rig, workspace, parameters)
     found = []
-    for i, j in _exclusive_pairs(left_px, right_px, rig, workspace, parameters):
+    for i, j in pairs.within:
         chain = _best_chain(_crossings(left_px[i], right_px[j], rig, workspace), rig, parameters)
         if chain is not None:
             candidate = _candidate(left[i], right[j], chain)
             if candidate.length_mm >= needle.min_length_mm / 2:
                 found.append(candidate)
     if not found:
-        raise NeedleNotFound("match", Reason.NO_STEREO_MATCH)
+        raise NeedleNotFound("match", Reason.OUTSIDE_WORKSPACE if pairs.elsewhere else Reason.NO_STEREO_MATCH)
     return sorted(found, key=lambda c: -c.score)[: parameters.max_candidates]
 
 
@@ -138,10 +139,18 @@ def _crossings(left_px: Float, right_px: Float, rig: StereoRig, box: Workspace) 
     return found.take(inside(box, points))
 
 
+@dataclass(frozen=True, slots=True)
+class _Pairs:
+    """Lines that are each other's best partners: those within the workspace, and how many there are elsewhere."""
+
+    within: list[tuple[int, int]]
+    elsewhere: int
+
+
 def _exclusive_pairs(
     left: list[Float], right: list[Float], rig: StereoRig, workspace: Workspace, parameters: MatchParameters
-) -> list[tuple[int, int]]:
-    """Pairs of lines that are each other's best partners at any depth, and that lie in the workspace."""
+) -> _Pairs:
+    """Pairs of lines that are each other's best partners at any depth."""
     nearest, furthest = workspace.z_mm.min * _DEPTH_MARGIN[0], workspace.z_mm.max * _DEPTH_MARGIN[1]
     everywhere = Range(min=-furthest, max=furthest)
     anywhere = Workspace(x_mm=everywhere, y_mm=everywhere, z_mm=Range(min=nearest, max=furthest))
@@ -153,7 +162,7 @@ def _exclusive_pairs(
             chains.append((i, j, chain))
     taken_left: dict[int, list[tuple[float, float]]] = {}
     taken_right: dict[int, list[tuple[float, float]]] = {}
-    pairs = []
+    within, elsewhere = [], 0
     for i, j, chain in sorted(chains, key=lambda c: -c[2].score):
         stretches = [(float(at.min()), float(at.max())) for at in (chain.crossings.left_at, chain.crossings.right_at)]
         if _is_taken(stretches[0], taken_left.get(i, [])) or _is_taken(stretches[1], taken_right.get(j, [])):
@@ -161,8 +170,10 @@ def _exclusive_pairs(
         taken_left.setdefault(i, []).append(stretches[0])
         taken_right.setdefault(j, []).append(stretches[1])
         if np.mean(inside(workspace, chain.crossings.points_mm)) > 0.5:
-            pairs.append((i, j))
-    return pairs
+            within.append((i, j))
+        else:
+            elsewhere += 1
+    return _Pairs(within, elsewhere)
 
 
 def _is_taken(stretch: tuple[float, float], taken: list[tuple[float, float]]) -> bool:

@@ -26,6 +26,8 @@ _EDGE_RISE_PX = 3.0
 # A streak so many times stronger than the rim beside it begins, and is certain, to push the rim's edge outwards.
 _STREAK_RATIO = (2.0, 4.0)
 _STREAK_REACH_PX = 4.0
+# Beside a streak as strong as the rim an edge is uncertain by this much, whatever the noise.
+_STREAK_SIGMA_PX = 0.6
 _STREAK_STATIONS = 15
 _GLARE_SHARE = 0.06
 _EDGE_STATIONS = 11
@@ -79,7 +81,7 @@ def find_silhouette(strip: Float, offsets: Float, limit_px: float, threshold_gra
     to_band = tilt * (inner + FLANK_PX / 2)
     # Both sides at once: the high one is the low one of the mirrored strip.
     both = np.concatenate([level, level[:, ::-1]])
-    edges, height = _outermost_edges(
+    edges, height, streak = _outermost_edges(
         both - np.concatenate([background[0] + to_band, background[1] - to_band])[:, None],
         offsets,
         limit_px,
@@ -88,7 +90,8 @@ def find_silhouette(strip: Float, offsets: Float, limit_px: float, threshold_gra
     n = len(strip)
     heights = np.maximum(np.stack([height[:n], height[n:]]), 1.0)
     edges = np.stack([_without_strays(edges[:n]), _without_strays(-edges[n:])])
-    return Silhouette(edges, _EDGE_RISE_PX * spread / heights, background)
+    doubt = _STREAK_SIGMA_PX * np.minimum(np.stack([streak[:n], streak[n:]]), 1.0)
+    return Silhouette(edges, np.hypot(_EDGE_RISE_PX * spread / heights, doubt), background)
 
 
 def _without_strays(edge_px: Float) -> Float:
@@ -108,8 +111,11 @@ def _bands(offsets: Float, inner_px: float) -> list[slice]:
     return [low, high]
 
 
-def _outermost_edges(departure: Float, offsets: Float, limit_px: float, threshold_gray: float) -> tuple[Float, Float]:
-    """First edge (K,) px from the low end inwards, NaN where none, and its height (K,), of departures (K, M)."""
+def _outermost_edges(
+    departure: Float, offsets: Float, limit_px: float, threshold_gray: float
+) -> tuple[Float, Float, Float]:
+    """First edge (K,) px from the low end inwards, NaN where none, its height (K,), of departures (K, M), and how
+    many times as strong a streak is behind it (K,)."""
     rows, columns = np.arange(len(departure)), np.arange(departure.shape[1])
     step_px = float(offsets[1] - offsets[0])
     reach = (offsets >= -limit_px - EDGE_SPREAD_PX) & (offsets <= limit_px)
@@ -140,7 +146,7 @@ def _outermost_edges(departure: Float, offsets: Float, limit_px: float, threshol
     streak = gaussian_filter1d(streak, 4.0, mode="nearest")
     blend = np.clip((streak - _STREAK_RATIO[0]) / (_STREAK_RATIO[1] - _STREAK_RATIO[0]), 0, 1)
     position = (1 - blend) * position + blend * offsets[top]
-    return np.where(exists, position, np.nan), np.where(exists, height, 0.0)
+    return np.where(exists, position, np.nan), np.where(exists, height, 0.0), np.where(exists, streak, 0.0)
 
 
 def find_line(strip: Float, offsets: Float, width_px: float, search_px: float, min_height_gray: float) -> Line:

@@ -86,6 +86,13 @@ class Refined:
     tip: TipFit
     tip_px: Float
 
+    @property
+    def tip_covariance_mm2(self) -> Float:
+        """Covariance (3, 3) of the tip: across the needle that of the curve, along it that of the signal's end."""
+        along = unit(self.fit.derivative(1)[-1])
+        covariance = self.fit.point_covariance_mm2()[-1] + max(self.tip.sigma_mm) ** 2 * np.outer(along, along)
+        return np.asarray((covariance + covariance.T) / 2)
+
 
 def refine(
     images: Images,

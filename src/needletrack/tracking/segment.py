@@ -21,6 +21,10 @@ Gray = npt.NDArray[np.float32]
 _REDUCED_WIDTH_PX = 0.9
 
 
+# Lines cover a few percent of an image; noise makes about a third of its pixels respond.
+_MIN_NOISE_SHARE = 0.1
+
+
 class SegmentParameters(BaseModel):
     """How faint a line may be."""
 
@@ -92,10 +96,11 @@ def _without_side_lobes(bright: Gray, dark: Gray) -> tuple[Gray, Gray]:
 
 
 def _hysteresis(response: Gray, parameters: SegmentParameters) -> Mask:
-    # The median of the positive responses is a measure of noise: lines cover a few percent of an image.
-    positive = response[::2, ::2]
-    positive = positive[positive > 0]
-    noise = float(np.median(positive)) if positive.size else 0.0
+    # The median of the positive responses is a measure of noise where they are noise: in an overexposed image only
+    # the lines themselves respond, and nothing is to be told from them.
+    sample = response[::2, ::2]
+    positive = sample[sample > 0]
+    noise = float(np.median(positive)) if positive.size > _MIN_NOISE_SHARE * sample.size else 0.0
     high = max(parameters.high_threshold_noise * noise, parameters.min_response_gray)
     low = min(high, max(parameters.low_threshold_noise * noise, parameters.min_response_gray / 2))
     candidates = (response > low).astype(np.uint8)

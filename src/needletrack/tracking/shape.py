@@ -83,13 +83,11 @@ def as_track(
     along = unit(fit.derivative(1)[[0, -1]])
     tip = None
     if Reason.TIP_NOT_SEEN not in shape.reasons:
-        across = fit.point_covariance_mm2()[-1]
-        covariance_mm2 = across + max(shape.refined.tip.sigma_mm) ** 2 * np.outer(along[1], along[1])
         tip = TipPose(
             points_mm[-1],
             along[1],
             orientation_along(along[1]),
-            (covariance_mm2 + covariance_mm2.T) / 2,
+            shape.refined.tip_covariance_mm2,
             _velocity_mm_s(points_mm[-1], captured_at_ns, previous),
             int(shape.curve.seen[-1]),
         )

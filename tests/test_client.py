@@ -50,9 +50,7 @@ def message(
 ) -> TrackMessage:
     """A message captured age_ns before now, on its own clock; a recorded stamp is 1970's."""
     now = Instant.now()
-    captured_at_ns = {Clock.REALTIME: now.unix_ns, Clock.MONOTONIC: now.monotonic_ns}.get(
-        clock, age_ns
-    ) - age_ns
+    captured_at_ns = {Clock.REALTIME: now.unix_ns, Clock.MONOTONIC: now.monotonic_ns}.get(clock, age_ns) - age_ns
     image = np.zeros((2, 2), dtype=np.uint8)
     frame = Frame(image, captured_at_ns)
     released_at_ns = now.monotonic_ns if clock is Clock.RECORDED else None
@@ -301,9 +299,7 @@ def test_a_late_joiner_has_the_status_at_once(endpoint: str) -> None:
 def test_a_daemon_that_comes_later_is_found(endpoint: str) -> None:
     with patient([endpoint]) as subscriber:
         assert state(subscriber) is Freshness.NEVER_SEEN
-        with pytest.raises(
-            PublishError, match=f"nobody answers at {endpoint} within 0.05 s: is the daemon running"
-        ):
+        with pytest.raises(PublishError, match=f"nobody answers at {endpoint} within 0.05 s: is the daemon running"):
             subscriber.wait_for_daemon(0.05)
         with daemon(endpoint) as publisher:
             subscriber.wait_for_daemon(WAIT_S)

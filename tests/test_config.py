@@ -70,9 +70,7 @@ def described_in_default_toml() -> dict[tuple[str, str], str]:
     return comments
 
 
-@pytest.mark.parametrize(
-    ("table", "key", "field", "default"), ALL_KEYS, ids=[f"{t}.{k}" for t, k, *_ in ALL_KEYS]
-)
+@pytest.mark.parametrize(("table", "key", "field", "default"), ALL_KEYS, ids=[f"{t}.{k}" for t, k, *_ in ALL_KEYS])
 def test_default_toml_holds_every_key_with_its_default_and_its_explanation(
     table: str, key: str, field: FieldInfo, default: Any
 ) -> None:
@@ -102,9 +100,7 @@ def test_the_documented_file_is_one(tmp_path: Path) -> None:
 
 
 def test_a_file_changes_what_it_names_and_nothing_else(tmp_path: Path) -> None:
-    path = written(
-        tmp_path, '[tracking.needle]\nmax_length_mm = 80\n[publishing]\nconnect = ["tls/router:7447"]'
-    )
+    path = written(tmp_path, '[tracking.needle]\nmax_length_mm = 80\n[publishing]\nconnect = ["tls/router:7447"]')
     config = load_config(path)
     assert config.tracking.needle.max_length_mm == 80.0
     assert config.publishing.connect == ("tls/router:7447",)
@@ -112,9 +108,7 @@ def test_a_file_changes_what_it_names_and_nothing_else(tmp_path: Path) -> None:
     assert config.publishing.listen == Config().publishing.listen
 
 
-def test_the_environment_overrides_the_file_key_by_key(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_environment_overrides_the_file_key_by_key(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = written(tmp_path, "[tracking.needle]\nmax_length_mm = 80.0\nmin_length_mm = 12.0")
     monkeypatch.setenv("NEEDLETRACK_TRACKING__NEEDLE__MAX_LENGTH_MM", "90")
     monkeypatch.setenv("NEEDLETRACK_TRACKING__WORKSPACE__Z_MM__MAX", "400")
@@ -144,10 +138,7 @@ def test_a_path_in_the_environment_is_relative_to_the_working_directory(
     (tmp_path / "elsewhere").mkdir()
     monkeypatch.chdir(tmp_path / "elsewhere")
     monkeypatch.setenv("NEEDLETRACK_RIG__PATH", "mine.yaml")
-    assert (
-        load_config(written(tmp_path, '[rig]\npath = "a.yaml"')).rig.path
-        == tmp_path / "elsewhere" / "mine.yaml"
-    )
+    assert load_config(written(tmp_path, '[rig]\npath = "a.yaml"')).rig.path == tmp_path / "elsewhere" / "mine.yaml"
 
 
 def test_an_absolute_path_stays(tmp_path: Path) -> None:

@@ -102,9 +102,7 @@ class TestFrozenArray:
         assert frozen_array(np.arange(3, dtype=np.float32), (3,), "x").dtype == np.float64
 
     @pytest.mark.parametrize("dtype", [np.uint16, np.int16, np.float32, np.float64])
-    def test_an_image_of_more_than_eight_bits_is_refused_and_not_wrapped(
-        self, dtype: type[np.generic]
-    ) -> None:
+    def test_an_image_of_more_than_eight_bits_is_refused_and_not_wrapped(self, dtype: type[np.generic]) -> None:
         with pytest.raises(ValueError, match="image is an array of"):
             Frame(np.full((2, 2), 300, dtype=dtype), 0)
 

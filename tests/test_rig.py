@@ -106,9 +106,7 @@ def test_a_written_rig_reads_back_to_the_last_bit(
     matrix = np.array([[focal, 0.125, 640.1], [0.0, focal * 1.001, 511.9], [0.0, 0.0, 1.0]])
     pose = RigidTransform(Rotation.from_rotvec(angles).as_matrix(), np.array(translation))
     right = Camera(matrix, np.array(distortion), (1280, 1024))
-    rig = a_rig(
-        right=right, right_from_left=pose, calibration=CalibrationInfo(reprojection_rms_px=reprojection)
-    )
+    rig = a_rig(right=right, right_from_left=pose, calibration=CalibrationInfo(reprojection_rms_px=reprojection))
     with tempfile.TemporaryDirectory() as folder:
         write_rig(rig, Path(folder) / "rig.yaml")
         assert_same(read_rig(Path(folder) / "rig.yaml"), rig)
@@ -154,9 +152,7 @@ def test_a_missing_folder_is_named(tmp_path: Path) -> None:
 def test_a_rotation_rounded_to_five_decimals_is_made_exact(tmp_path: Path) -> None:
     document = document_of(a_rig(), tmp_path)
     rounded = np.round(a_rig().right_from_left.rotation, 5)
-    read = read_rig(
-        dumped(changed(document, "right_from_left.rotation", rounded.tolist()), tmp_path / "r.yaml")
-    )
+    read = read_rig(dumped(changed(document, "right_from_left.rotation", rounded.tolist()), tmp_path / "r.yaml"))
     rotation = read.right_from_left.rotation
     assert np.abs(rotation @ rotation.T - np.eye(3)).max() < 1e-14
     # Nine entries, each rounded by 0.5e-5 at most.
@@ -371,9 +367,7 @@ def test_a_rig_file_that_contradicts_the_camchain_is_refused(
 ) -> None:
     write_rig(import_camchain(LAB_A / "camchain.yaml"), tmp_path / "rig.yaml")
     dumped(changed(camchain(), key, value), tmp_path / "camchain.yaml")
-    with pytest.raises(
-        CalibrationError, match=f"rig.yaml and camchain.yaml contradict each other: {message}"
-    ):
+    with pytest.raises(CalibrationError, match=f"rig.yaml and camchain.yaml contradict each other: {message}"):
         find_rig(tmp_path)
 
 
@@ -402,9 +396,7 @@ def test_a_folder_without_a_rig_says_what_to_add(tmp_path: Path) -> None:
 def test_two_camchains_are_refused(tmp_path: Path) -> None:
     for name in ("camchain.yaml", "old-camchain.yaml"):
         dumped(camchain(), tmp_path / name)
-    with pytest.raises(
-        CalibrationError, match=r"more than one camchain \(camchain\.yaml, old-camchain\.yaml\)"
-    ):
+    with pytest.raises(CalibrationError, match=r"more than one camchain \(camchain\.yaml, old-camchain\.yaml\)"):
         find_rig(tmp_path)
 
 
@@ -417,9 +409,7 @@ def test_the_digest_tells_geometries_apart_and_nothing_else() -> None:
     assert a_rig("other", calibration=CalibrationInfo()).digest == rig.digest
     five_terms = Camera(rig.left.matrix, np.append(rig.left.distortion, 0.0), rig.left.size_px)
     assert a_rig(left=five_terms).digest == rig.digest
-    moved = RigidTransform(
-        rig.right_from_left.rotation, rig.right_from_left.translation_mm + np.array([0, 0, 1e-4])
-    )
+    moved = RigidTransform(rig.right_from_left.rotation, rig.right_from_left.translation_mm + np.array([0, 0, 1e-4]))
     assert a_rig(right_from_left=moved).digest != rig.digest
     assert a_rig(left=rig.right, right=rig.left).digest != rig.digest
 

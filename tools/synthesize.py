@@ -58,9 +58,7 @@ def write_recording(folder: Path, world: World, count: int, rate_hz: float, mate
 
 def main(arguments: list[str] | None = None) -> None:
     """Write what the command line asks for."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.ArgumentDefaultsHelpFormatter
-    )
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.ArgumentDefaultsHelpFormatter)
     parser.add_argument("folder", type=Path)
     parser.add_argument("--count", type=int, default=60, help="pairs")
     parser.add_argument("--rate", type=float, default=30.0, help="pairs a second")

@@ -69,9 +69,7 @@ class PairingConfig(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    tolerance_us: Positive = Field(
-        1000.0, description="Greatest difference of the two stamps of a pair, microseconds."
-    )
+    tolerance_us: Positive = Field(1000.0, description="Greatest difference of the two stamps of a pair, microseconds.")
 
 
 class PublishingConfig(BaseModel):
@@ -86,9 +84,7 @@ class PublishingConfig(BaseModel):
     connect: tuple[Endpoint, ...] = Field(
         (), description="Zenoh endpoints to connect to, such as a router's, protocol/address."
     )
-    key_prefix: KeyPrefix = Field(
-        "needletrack", description="First part of every key: <key_prefix>/<rig>/track."
-    )
+    key_prefix: KeyPrefix = Field("needletrack", description="First part of every key: <key_prefix>/<rig>/track.")
     heartbeat_s: Annotated[Positive, Le(60)] = Field(
         0.5, description="Interval of the status messages, seconds, at most 60."
     )
@@ -164,11 +160,7 @@ def _variables() -> dict[str, tuple[str, ...]]:
     for name, keys in variables.items():
         if keys not in known:
             near = nearest_key(Config, keys)
-            hint = (
-                f"did you mean {_variable(near)}?"
-                if near
-                else "docs/configuration.md tells how they are named"
-            )
+            hint = f"did you mean {_variable(near)}?" if near else "docs/configuration.md tells how they are named"
             raise ConfigError(f"environment variable {name}: no such key: {hint}")
     return variables
 

@@ -283,9 +283,7 @@ class _Cameras(BaseModel):
 class _Pose(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    rotation: tuple[Row3, Row3, Row3] = Field(
-        description="3 × 3 matrix, by rows, with five decimals or more."
-    )
+    rotation: tuple[Row3, Row3, Row3] = Field(description="3 × 3 matrix, by rows, with five decimals or more.")
     translation_mm: Row3 = Field(description="The left camera's centre in the right camera's frame, mm.")
 
 
@@ -333,9 +331,7 @@ class _CamchainCamera(BaseModel):
     def _has_its_terms(self) -> Self:
         terms = {"radtan": 4, "none": 0}[self.distortion_model]
         if len(self.distortion_coeffs) != terms:
-            raise ValueError(
-                f"{self.distortion_model} has {terms} coefficients, not {len(self.distortion_coeffs)}"
-            )
+            raise ValueError(f"{self.distortion_model} has {terms} coefficients, not {len(self.distortion_coeffs)}")
         return self
 
     def camera(self) -> Camera:

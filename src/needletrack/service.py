@@ -26,7 +26,6 @@ from needletrack.publish.message import (
 from needletrack.records import DropReason, NeedleTrack, Status, StereoPair
 from needletrack.rig import Rig
 
-
 # A daemon runs for days: its memory must not grow with them.
 _TIMES_KEPT = 10_000
 
@@ -49,7 +48,7 @@ class Sink(Protocol):
 
 @dataclass(frozen=True)
 class RunSummary:
-    """What a run did: tracks by status, losses by reason, duration, and the worker's time for each of the last pairs."""
+    """What a run did: tracks by status, losses by reason, duration, and the worker's time for the last pairs."""
 
     statuses: Mapping[Status, int]
     reasons: Mapping[str, int]

@@ -160,9 +160,7 @@ def table1(folder: Path | str, repeats: int = 9, parameters: TrackingParameters 
     best = min(range(len(pairs)), key=lambda i: abs(len(results[i].left.skeleton_px) - PAPER[1][0]))
     pair, result, rig = pairs[best], results[best], recording.rig
     own = [track_pair(each, rig, parameters) for each in pairs]
-    as_printed = reference_stages(
-        pair.left.image, pair.right.image, rig, ReferenceParameters(absolute_residual=False)
-    )
+    as_printed = reference_stages(pair.left.image, pair.right.image, rig, ReferenceParameters(absolute_residual=False))
     at_px = threshold_px(fundamental_matrix(rig), result.left.points_px, ReferenceParameters().threshold)
     return Table1(
         recording=recording.folder.name,
@@ -176,8 +174,7 @@ def table1(folder: Path | str, repeats: int = 9, parameters: TrackingParameters 
         as_printed_pairs=len(as_printed.pairs),
         as_printed_px=as_printed.error.mean_px,
         frames=tuple(
-            _frame_row(each, rig, found, track, truth)
-            for each, found, track in zip(pairs, results, own, strict=True)
+            _frame_row(each, rig, found, track, truth) for each, found, track in zip(pairs, results, own, strict=True)
         ),
     )
 

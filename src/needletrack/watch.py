@@ -201,18 +201,14 @@ class _Tally:
                 f"{_number(self._newest.latency_ms, 1)} ms   p50 {_number(self._latency_ms(50), 1)}"
                 f"   p99 {_number(self._latency_ms(99), 1)}",
             )
-            rows.add_row(
-                "rate", f"{_number(self._rate_hz(), 1)} Hz   {self.messages} tracks   {self._shares()}"
-            )
+            rows.add_row("rate", f"{_number(self._rate_hz(), 1)} Hz   {self.messages} tracks   {self._shares()}")
             rows.add_row("missed", self._missed())
         age = "" if health.age_ms is None else f"   {health.age_ms:.0f} ms old"
         reason = f"   {health.reason}" if health.reason else ""
         rows.add_row("link", Text(f"{health.state.value}{age}{reason}", style=HEALTH_STYLE[health.state]))
         if (status := self._subscriber.status) is not None:
             rows.add_row("daemon", _daemon(status))
-        return Panel(
-            rows, title=f"needletrack · {self._subscriber.keys.rig}", subtitle=self._where, title_align="left"
-        )
+        return Panel(rows, title=f"needletrack · {self._subscriber.keys.rig}", subtitle=self._where, title_align="left")
 
     def _rate_hz(self) -> float | None:
         since_ns = time.monotonic_ns() - int(RATE_OVER_S * 1e9)
@@ -260,10 +256,7 @@ def _tip(received: Received) -> str:
     if tip is None:
         return "-"
     axes = zip("xyz", tip.position_mm, range(3), strict=True)
-    return (
-        "  ".join(f"{axis} {mm:.2f} ± {math.sqrt(tip.covariance_mm2[i][i]):.2f}" for axis, mm, i in axes)
-        + " mm"
-    )
+    return "  ".join(f"{axis} {mm:.2f} ± {math.sqrt(tip.covariance_mm2[i][i]):.2f}" for axis, mm, i in axes) + " mm"
 
 
 def _daemon(status: StatusMessage) -> str:

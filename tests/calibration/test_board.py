@@ -83,9 +83,7 @@ def test_corners_are_spaced_by_the_square() -> None:
     np.testing.assert_allclose(np.diff(grid, axis=0), np.broadcast_to([0, 5, 0], (rows - 1, columns, 3)))
 
 
-@pytest.mark.parametrize(
-    ("columns", "rows", "square_mm"), [(3, 9, 2.0), (9, 3, 2.0), (11, 11, 0.0), (11, 11, np.nan)]
-)
+@pytest.mark.parametrize(("columns", "rows", "square_mm"), [(3, 9, 2.0), (9, 3, 2.0), (11, 11, 0.0), (11, 11, np.nan)])
 def test_a_board_that_cannot_be_detected_is_refused(columns: int, rows: int, square_mm: float) -> None:
     with pytest.raises(CalibrationError, match="at least 4 squares"):
         Checkerboard(columns, rows, square_mm)

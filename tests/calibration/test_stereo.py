@@ -39,8 +39,7 @@ def board_recording(name: str) -> BoardRecording:
     squares_x, squares_y = truth["board"]["squares"]
     board = Checkerboard(squares_x, squares_y, truth["board"]["square_mm"])
     left, right = (
-        Camera(np.array(camera["K"]), np.array(camera["dist"]), tuple(camera["size"]))
-        for camera in truth["cameras"]
+        Camera(np.array(camera["K"]), np.array(camera["dist"]), tuple(camera["size"])) for camera in truth["cameras"]
     )
     pose = RigidTransform(np.array(truth["cameras"][1]["R"]), np.array(truth["cameras"][1]["t"]))
     # The detector takes a quarter of a second a picture, and leaves Python's lock alone.
@@ -90,9 +89,7 @@ def board_poses(count: int, seed: int = 3) -> list[RigidTransform]:
     random = np.random.default_rng(seed)
     poses = []
     for _ in range(count):
-        rotation = Rotation.from_euler(
-            "zyx", [random.uniform(-180, 180), *random.uniform(-40, 40, 2)], degrees=True
-        )
+        rotation = Rotation.from_euler("zyx", [random.uniform(-180, 180), *random.uniform(-40, 40, 2)], degrees=True)
         center_mm = np.array([*random.uniform(-40, 40, 2), random.uniform(220, 290)])
         matrix = rotation.as_matrix()
         poses.append(RigidTransform(matrix, center_mm - matrix @ PAPER.points_mm.mean(axis=0)))
@@ -204,9 +201,7 @@ def test_too_few_views_are_refused_with_the_remedy() -> None:
     rig = default_rig()
     views = drawn(rig, PAPER, board_poses(MIN_VIEWS))
     views[0] = BoardView(None, None)
-    with pytest.raises(
-        CalibrationError, match=r"3 usable views .* show the whole board .* view 0: .* not found"
-    ):
+    with pytest.raises(CalibrationError, match=r"3 usable views .* show the whole board .* view 0: .* not found"):
         calibrate_stereo(views, PAPER, rig.left.size_px)
 
 
@@ -232,9 +227,7 @@ def test_epipolar_geometry_of_the_calibrated_rig_holds_for_the_corners(large_boa
     right_center_mm = rig.right_from_left.inverse().apply(np.zeros(3))
     left_center_mm = rig.right_from_left.apply(np.zeros(3))
     np.testing.assert_allclose(left_epipole / left_epipole[2], pinhole(rig.left, right_center_mm), rtol=1e-9)
-    np.testing.assert_allclose(
-        right_epipole / right_epipole[2], pinhole(rig.right, left_center_mm), rtol=1e-9
-    )
+    np.testing.assert_allclose(right_epipole / right_epipole[2], pinhole(rig.right, left_center_mm), rtol=1e-9)
     assert np.linalg.norm(rig.fundamental @ left_epipole) < 1e-9 * np.linalg.norm(left_epipole)
     assert np.linalg.norm(rig.fundamental.T @ right_epipole) < 1e-9 * np.linalg.norm(right_epipole)
 

@@ -47,9 +47,7 @@ def _rigs(draw: st.DrawFn) -> StereoRig:
     # Turned towards what the left camera sees at 250 mm, and a little any other way.
     toe_in = Rotation.from_euler("y", np.arctan2(baseline_mm / 2, 250.0)).as_matrix()
     rotation = draw(_rotations(0.1)) @ toe_in
-    return StereoRig(
-        draw(_cameras(size_px)), draw(_cameras(size_px)), RigidTransform(rotation, -rotation @ center_mm)
-    )
+    return StereoRig(draw(_cameras(size_px)), draw(_cameras(size_px)), RigidTransform(rotation, -rotation @ center_mm))
 
 
 @pytest.fixture(scope="session")

@@ -18,9 +18,7 @@ def pixels_in(camera: Camera, data: st.DataObject) -> Float:
 
 @settings(max_examples=40)
 @given(data=st.data())
-def test_distorting_what_was_undistorted_gives_it_back(
-    cameras: st.SearchStrategy[Camera], data: st.DataObject
-) -> None:
+def test_distorting_what_was_undistorted_gives_it_back(cameras: st.SearchStrategy[Camera], data: st.DataObject) -> None:
     camera = data.draw(cameras)
     pixels = pixels_in(camera, data)
     np.testing.assert_allclose(camera.distort(camera.undistort(pixels)), pixels, atol=1e-7)
@@ -28,9 +26,7 @@ def test_distorting_what_was_undistorted_gives_it_back(
 
 @settings(max_examples=40)
 @given(data=st.data())
-def test_a_projected_point_lies_on_its_own_ray(
-    cameras: st.SearchStrategy[Camera], data: st.DataObject
-) -> None:
+def test_a_projected_point_lies_on_its_own_ray(cameras: st.SearchStrategy[Camera], data: st.DataObject) -> None:
     camera = data.draw(cameras)
     rays = camera.normalize(pixels_in(camera, data))
     depth_mm = data.draw(st.floats(1.0, 1e4))

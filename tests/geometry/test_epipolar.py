@@ -32,20 +32,12 @@ def test_the_cross_matrix_is_the_cross_product(vector: tuple[float, ...], other:
 
 @settings(max_examples=40)
 @given(data=st.data())
-def test_projections_of_a_point_obey_the_fundamental_matrix(
-    seen_points: SeenPoints, data: st.DataObject
-) -> None:
+def test_projections_of_a_point_obey_the_fundamental_matrix(seen_points: SeenPoints, data: st.DataObject) -> None:
     rig, points_mm = data.draw(seen_points)
     left_px, right_px = undistorted(rig, points_mm)
-    np.testing.assert_allclose(
-        epipolar.epipolar_distance_px(rig.fundamental, left_px, right_px), 0.0, atol=1e-6
-    )
-    np.testing.assert_allclose(
-        epipolar.epipolar_distance_px(rig.fundamental.T, right_px, left_px), 0.0, atol=1e-6
-    )
-    np.testing.assert_allclose(
-        epipolar.sampson_distance_px(rig.fundamental, left_px, right_px), 0.0, atol=1e-6
-    )
+    np.testing.assert_allclose(epipolar.epipolar_distance_px(rig.fundamental, left_px, right_px), 0.0, atol=1e-6)
+    np.testing.assert_allclose(epipolar.epipolar_distance_px(rig.fundamental.T, right_px, left_px), 0.0, atol=1e-6)
+    np.testing.assert_allclose(epipolar.sampson_distance_px(rig.fundamental, left_px, right_px), 0.0, atol=1e-6)
 
 
 @settings(max_examples=40)
@@ -90,9 +82,7 @@ def test_an_epipole_is_the_picture_of_the_other_camera(rigs: Rigs, data: st.Data
         (rig.left.matrix, rig.right_from_left.inverse().translation_mm, left_epipole),
         (rig.right.matrix, rig.right_from_left.translation_mm, right_epipole),
     ):
-        np.testing.assert_allclose(
-            np.cross(matrix @ center_mm, epipole), 0.0, atol=1e-6 * float(epipole @ epipole)
-        )
+        np.testing.assert_allclose(np.cross(matrix @ center_mm, epipole), 0.0, atol=1e-6 * float(epipole @ epipole))
 
 
 @settings(max_examples=40)
@@ -109,9 +99,7 @@ def test_the_distance_map_is_the_distance_of_each_pair(rigs: Rigs, data: st.Data
 
 @settings(max_examples=40)
 @given(data=st.data(), seed=SEEDS)
-def test_the_distance_is_that_of_the_nearest_point_of_the_line(
-    rigs: Rigs, data: st.DataObject, seed: int
-) -> None:
+def test_the_distance_is_that_of_the_nearest_point_of_the_line(rigs: Rigs, data: st.DataObject, seed: int) -> None:
     rig = data.draw(rigs)
     left_px, right_px = anywhere(rig, seed, 6), anywhere(rig, seed + 1, 6)
     a, b, c = epipolar.epipolar_lines(rig.fundamental, left_px).T

@@ -20,9 +20,9 @@ def test_cameras_in_one_place_are_refused() -> None:
 
 def test_the_baseline_is_the_distance_of_the_cameras() -> None:
     turned = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
-    assert StereoRig(
-        CAMERA, CAMERA, RigidTransform(turned, np.array([3.0, 4.0, 12.0]))
-    ).baseline_mm == pytest.approx(13.0)
+    assert StereoRig(CAMERA, CAMERA, RigidTransform(turned, np.array([3.0, 4.0, 12.0]))).baseline_mm == pytest.approx(
+        13.0
+    )
 
 
 def test_a_parallel_rig_projects_with_disparity_focal_times_baseline_over_depth() -> None:
@@ -53,6 +53,4 @@ def test_rectification_turns_epipolar_lines_into_rows(seen_points: SeenPoints, d
     assert (left_px[:, 0] > right_px[:, 0]).all()
     # The disparity gives the depth along the rectified axis.
     depth_mm = (points_mm @ left_rotation.T)[:, 2]
-    np.testing.assert_allclose(
-        matrix[0, 0] * rig.baseline_mm / (left_px[:, 0] - right_px[:, 0]), depth_mm, rtol=1e-6
-    )
+    np.testing.assert_allclose(matrix[0, 0] * rig.baseline_mm / (left_px[:, 0] - right_px[:, 0]), depth_mm, rtol=1e-6)

@@ -24,9 +24,7 @@ def test_products_are_associative_and_apply_in_turn(
     a_from_b, b_from_c, c_from_d = (data.draw(transforms) for _ in range(3))
     point = data.draw(vectors)
     assert_same((a_from_b @ b_from_c) @ c_from_d, a_from_b @ (b_from_c @ c_from_d))
-    np.testing.assert_allclose(
-        (a_from_b @ b_from_c).apply(point), a_from_b.apply(b_from_c.apply(point)), atol=1e-9
-    )
+    np.testing.assert_allclose((a_from_b @ b_from_c).apply(point), a_from_b.apply(b_from_c.apply(point)), atol=1e-9)
 
 
 @given(data=st.data())
@@ -41,15 +39,11 @@ def test_the_inverse_undoes(transforms: Transforms, vectors: Vectors, data: st.D
 def test_distances_do_not_change(transforms: Transforms, vectors: Vectors, data: st.DataObject) -> None:
     a_from_b, points = data.draw(transforms), np.array([data.draw(vectors) for _ in range(2)])
     moved = a_from_b.apply(points)
-    np.testing.assert_allclose(
-        np.linalg.norm(np.diff(moved, axis=0)), np.linalg.norm(np.diff(points, axis=0))
-    )
+    np.testing.assert_allclose(np.linalg.norm(np.diff(moved, axis=0)), np.linalg.norm(np.diff(points, axis=0)))
 
 
 def test_points_of_any_shape_are_moved_one_by_one() -> None:
-    quarter = RigidTransform(
-        np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]), np.array([10.0, 0.0, 0.0])
-    )
+    quarter = RigidTransform(np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]), np.array([10.0, 0.0, 0.0]))
     np.testing.assert_allclose(quarter.apply([1.0, 2.0, 3.0]), [8.0, 1.0, 3.0])
     grid = np.arange(24.0).reshape(2, 4, 3)
     moved = quarter.apply(grid)
@@ -77,9 +71,7 @@ def test_a_transform_does_not_change_with_the_arrays_it_was_made_of() -> None:
         (np.eye(3), np.zeros(2), "translation_mm has shape"),
     ],
 )
-def test_what_is_no_rigid_transform_is_refused(
-    rotation: Float, translation_mm: Float, complaint: str
-) -> None:
+def test_what_is_no_rigid_transform_is_refused(rotation: Float, translation_mm: Float, complaint: str) -> None:
     with pytest.raises(ValueError, match=complaint):
         RigidTransform(rotation, translation_mm)
 
@@ -91,9 +83,7 @@ def test_the_nearest_rotation_of_a_rotation_is_itself(transforms: Transforms, da
 
 
 @given(data=st.data(), seed=st.integers(0, 2**32 - 1))
-def test_no_rotation_lies_nearer_than_the_nearest(
-    transforms: Transforms, data: st.DataObject, seed: int
-) -> None:
+def test_no_rotation_lies_nearer_than_the_nearest(transforms: Transforms, data: st.DataObject, seed: int) -> None:
     rng = np.random.default_rng(seed)
     rounded = data.draw(transforms).rotation + rng.uniform(-1e-2, 1e-2, (3, 3))
     nearest = orthonormalized(rounded)

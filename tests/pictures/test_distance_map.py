@@ -25,9 +25,7 @@ def test_each_entry_is_a_distance_in_pixels(steer: AslRecording, true_track: Tru
     i, j = np.random.default_rng(1).integers([0, 0], found.distance_px.shape, (50, 2)).T
     rays = steer.rig.left.normalize(steer.rig.left.distort(found.left_undistorted_px[i]))
     near, far = (
-        steer.rig.right.undistort(
-            steer.rig.project(depth_mm * np.column_stack([rays, np.ones(len(rays))]))[1]
-        )
+        steer.rig.right.undistort(steer.rig.project(depth_mm * np.column_stack([rays, np.ones(len(rays))]))[1])
         for depth_mm in (200.0, 300.0)
     )
     along, offset = far - near, found.right_undistorted_px[j] - near
@@ -36,18 +34,14 @@ def test_each_entry_is_a_distance_in_pixels(steer: AslRecording, true_track: Tru
     np.testing.assert_allclose(found.distance_px[i, j], expected, atol=1e-5)
 
 
-def test_both_centerlines_are_followed_evenly_from_base_to_tip(
-    steer: AslRecording, true_track: TrueTrack
-) -> None:
+def test_both_centerlines_are_followed_evenly_from_base_to_tip(steer: AslRecording, true_track: TrueTrack) -> None:
     track, _ = true_track(-1)
     found = distance_map(track, steer.rig)
     assert found is not None
     assert track.curve is not None
     cameras = (steer.rig.left, steer.rig.right)
     lines = (found.left_undistorted_px, found.right_undistorted_px)
-    for camera, line_px, curve_px in zip(
-        cameras, lines, steer.rig.project(track.curve.points_mm), strict=True
-    ):
+    for camera, line_px, curve_px in zip(cameras, lines, steer.rig.project(track.curve.points_mm), strict=True):
         np.testing.assert_allclose(line_px[[0, -1]], camera.undistort(curve_px[[0, -1]]), atol=1e-6)
         steps = np.diff(arc_length(line_px))
         # Chords across the curve's vertices are shorter by the square of the angle there.
@@ -108,9 +102,7 @@ def test_pairs_beyond_the_ends_have_no_place(steer: AslRecording, true_track: Tr
     assert pairs is not None
     ahead = pairs.left_undistorted_px[-1] + 5 * tangents(pairs.left_undistorted_px)[-1]
     right_px = pairs.right_undistorted_px
-    longer = Correspondences(
-        np.vstack([pairs.left_undistorted_px, ahead]), np.vstack([right_px, right_px[-1]])
-    )
+    longer = Correspondences(np.vstack([pairs.left_undistorted_px, ahead]), np.vstack([right_px, right_px[-1]]))
     for left, right in (found.place(longer), found.offset(longer)):
         assert np.isnan(left).nonzero()[0].tolist() == [len(left) - 1]
         assert np.isfinite(right).all()
@@ -130,9 +122,7 @@ def test_without_a_curve_the_detected_centerlines_serve(steer: AslRecording, tru
     np.testing.assert_allclose(detected.distance_px, fitted.distance_px, atol=0.05)
 
 
-def test_without_centerlines_a_sentence_stands_in_its_place(
-    steer: AslRecording, true_track: TrueTrack
-) -> None:
+def test_without_centerlines_a_sentence_stands_in_its_place(steer: AslRecording, true_track: TrueTrack) -> None:
     track, pair = true_track(0)
     for evidence in (Evidence(), Evidence(left=track.evidence.left)):
         lost = replace(invalid(pair.captured_at_ns), evidence=evidence)

@@ -58,9 +58,7 @@ def texts(figure: Figure) -> str:
 
 
 @pytest.mark.parametrize("index", [0, -1])
-def test_the_curve_is_drawn_where_the_truth_projects(
-    steer: AslRecording, true_track: TrueTrack, index: int
-) -> None:
+def test_the_curve_is_drawn_where_the_truth_projects(steer: AslRecording, true_track: TrueTrack, index: int) -> None:
     track, pair = true_track(index)
     assert track.curve is not None
     figure = overlay_figure(track, pair, steer.rig)
@@ -89,9 +87,7 @@ def test_colors_say_how_many_cameras_saw_a_point(steer: AslRecording, true_track
 
 
 @pytest.mark.parametrize("index", [0, 12, -1])
-def test_the_enlarged_tips_hide_nothing_of_the_curve(
-    steer: AslRecording, true_track: TrueTrack, index: int
-) -> None:
+def test_the_enlarged_tips_hide_nothing_of_the_curve(steer: AslRecording, true_track: TrueTrack, index: int) -> None:
     track, pair = true_track(index)
     assert track.curve is not None
     assert track.tip is not None
@@ -126,9 +122,7 @@ def test_numbers_are_written_with_their_uncertainty(steer: AslRecording, true_tr
     assert "OK" in written
 
 
-def test_an_invalid_track_shows_both_images_and_its_reasons(
-    steer: AslRecording, true_track: TrueTrack
-) -> None:
+def test_an_invalid_track_shows_both_images_and_its_reasons(steer: AslRecording, true_track: TrueTrack) -> None:
     _, pair = true_track(0)
     reasons = (Reason.NO_STEREO_MATCH, Reason.OUTSIDE_WORKSPACE)
     figure = overlay_figure(NeedleTrack(pair.captured_at_ns, Status.INVALID, reasons), pair, steer.rig)
@@ -153,9 +147,7 @@ def test_an_invalid_track_shows_what_was_detected(steer: AslRecording, true_trac
     plain, marked = (rendered(overlay_figure(shown, pair, steer.rig)) for shown in (lost, seen))
     assert track.evidence.left is not None
     figure = overlay_figure(seen, pair, steer.rig)
-    columns, rows = (
-        np.round(in_picture(axes_named(figure, "left"), track.evidence.left.points_px)).astype(int).T
-    )
+    columns, rows = np.round(in_picture(axes_named(figure, "left"), track.evidence.left.points_px)).astype(int).T
     assert (marked[rows, columns].astype(int) > plain[rows, columns]).all()
     right = slice(picture_middle := plain.shape[1] // 2, None)
     assert picture_middle > 0

@@ -32,9 +32,7 @@ def test_a_figure_has_the_size_that_it_states(tmp_path: Path) -> None:
     assert (read == (0x17, 0x11, 0x0D)).all()
 
 
-def test_the_old_file_stays_whole_where_the_new_one_fails(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_old_file_stays_whole_where_the_new_one_fails(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = write_png(picture(), tmp_path / "a.png")
     before = path.read_bytes()
 

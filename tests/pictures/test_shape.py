@@ -71,9 +71,7 @@ def test_the_band_is_two_standard_deviations_times_the_stated_factor(true_track:
     track, _ = true_track(-1)
     assert track.curve is not None
     for sigma_mm, factor in ((0.05, 20), (3.0, 1)):
-        wide = replace(
-            track, curve=replace(track.curve, sigma_mm=np.full(len(track.curve.points_mm), sigma_mm))
-        )
+        wide = replace(track, curve=replace(track.curve, sigma_mm=np.full(len(track.curve.points_mm), sigma_mm)))
         figure = shape_figure(wide)
         for name, (right, up) in SIDES.items():
             points = track.curve.points_mm[:, [COLUMN[right], COLUMN[up]]]

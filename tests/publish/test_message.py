@@ -108,18 +108,14 @@ def test_a_message_survives_the_wire(track: NeedleTrack, dropped: dict[DropReaso
     assert plain["reasons"] == list(track.reasons)
     assert plain["dropped"] == {reason: count for reason, count in dropped.items() if count}
     if track.curve is None:
-        assert all(
-            plain[field] is None for field in ("centerline_mm", "sigma_mm", "seen", "length_mm", "tip")
-        )
+        assert all(plain[field] is None for field in ("centerline_mm", "sigma_mm", "seen", "length_mm", "tip"))
         return
     np.testing.assert_allclose(plain["centerline_mm"], track.curve.points_mm, rtol=0, atol=0.51e-6)
     np.testing.assert_allclose(plain["sigma_mm"], track.curve.sigma_mm, rtol=0, atol=0.51e-6)
     np.testing.assert_allclose(plain["curvature_per_mm"], track.curve.curvature_per_mm, rtol=0, atol=0.51e-9)
     assert plain["seen"] == track.curve.seen.tolist()
     if track.tip is not None:
-        np.testing.assert_allclose(
-            plain["tip"]["covariance_mm2"], track.tip.covariance_mm2, rtol=0, atol=1e-12
-        )
+        np.testing.assert_allclose(plain["tip"]["covariance_mm2"], track.tip.covariance_mm2, rtol=0, atol=1e-12)
         np.testing.assert_allclose(plain["tip"]["direction"], track.tip.direction, rtol=0, atol=1e-9)
 
 
@@ -175,9 +171,7 @@ def test_a_deterministic_run_has_the_same_bytes_each_time() -> None:
 def test_the_order_of_the_drop_counts_does_not_matter() -> None:
     counts = {DropReason.WRONG_SIZE: 1, DropReason.OVERWRITTEN: 2}
     messages = [
-        TrackMessage.from_track(
-            an_invalid_track(), a_pair(), example_run(), dropped=dropped, published=NOW
-        ).to_json()
+        TrackMessage.from_track(an_invalid_track(), a_pair(), example_run(), dropped=dropped, published=NOW).to_json()
         for dropped in (counts, dict(reversed(counts.items())))
     ]
     assert messages[0] == messages[1]

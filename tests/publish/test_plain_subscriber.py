@@ -56,9 +56,7 @@ def test_it_acts_on_good_tracks_and_holds_on_others(endpoint: str) -> None:
                 for sequence, answer in zip((7, 8, 11, 12), answers, strict=True):
                     message = TrackMessage.from_track(answer, pair, run, dropped={}, published=Instant.now())
                     late_ms = 70_000.0 if sequence == 12 else 8.0
-                    publisher.publish(
-                        message.model_copy(update={"sequence": sequence, "latency_ms": late_ms})
-                    )
+                    publisher.publish(message.model_copy(update={"sequence": sequence, "latency_ms": late_ms}))
                 output, _ = process.communicate(timeout=WAIT_S)
             finally:
                 process.kill()

@@ -28,15 +28,11 @@ def validator(name: str) -> Draft202012Validator:
 def test_the_documents_have_not_drifted() -> None:
     for name, text in schema.documents(PAGE.read_text(encoding="utf-8")):
         path = DOCS / "wire" / name if name else PAGE
-        assert path.read_text(encoding="utf-8") == text, (
-            f"run `make schema`: {path} is not what the models say"
-        )
+        assert path.read_text(encoding="utf-8") == text, f"run `make schema`: {path} is not what the models say"
 
 
 def test_stale_documents_are_brought_up(tmp_path: Path) -> None:
-    page = re.sub(
-        r"(<!-- generated: reasons -->\n).*?(<!-- end -->)", r"\1old\n\2", PAGE.read_text(), flags=re.S
-    )
+    page = re.sub(r"(<!-- generated: reasons -->\n).*?(<!-- end -->)", r"\1old\n\2", PAGE.read_text(), flags=re.S)
     (tmp_path / "wire.md").write_text(page, encoding="utf-8")
     schema.write(tmp_path / "wire")
     assert (tmp_path / "wire.md").read_text(encoding="utf-8") == PAGE.read_text(encoding="utf-8")

@@ -39,9 +39,7 @@ def test_a_taken_port_is_named_with_the_remedy() -> None:
 
 
 def test_any_other_failure_is_told_in_zenohs_words() -> None:
-    with pytest.raises(
-        PublishError, match=r"no Zenoh session with listen \['tcp/host\.invalid:7447'\].*lookup"
-    ):
+    with pytest.raises(PublishError, match=r"no Zenoh session with listen \['tcp/host\.invalid:7447'\].*lookup"):
         open_session(listen=["tcp/host.invalid:7447"])
 
 

@@ -67,9 +67,7 @@ def test_frames_are_the_files_pixels_and_stamps() -> None:
     pair = AslRecording(RECORDINGS / "lab-a").read(1)
     assert (pair.left.captured_at_ns, pair.right.captured_at_ns) == (1_033_333_333, 1_033_355_211)
     for frame, file in ((pair.left, "cam0/data/1033333333.png"), (pair.right, "cam1/data/1033355211.png")):
-        np.testing.assert_array_equal(
-            frame.image, cv2.imread(str(RECORDINGS / "lab-a" / file), cv2.IMREAD_UNCHANGED)
-        )
+        np.testing.assert_array_equal(frame.image, cv2.imread(str(RECORDINGS / "lab-a" / file), cv2.IMREAD_UNCHANGED))
 
 
 def test_first_and_last_stamp_and_length_are_known_without_reading_images(tmp_path: Path) -> None:
@@ -265,9 +263,7 @@ def test_a_file_far_longer_than_its_image_is_not_read_to_its_end(tmp_path: Path)
 
 def test_one_image_of_another_size_is_lost(tmp_path: Path) -> None:
     folder = write_recording(tmp_path, [10 * MS, 20 * MS])
-    (folder / "cam1" / "data" / f"{10 * MS}.png").write_bytes(
-        png((32, 24), rows(np.zeros((24, 32), np.uint8)))
-    )
+    (folder / "cam1" / "data" / f"{10 * MS}.png").write_bytes(png((32, 24), rows(np.zeros((24, 32), np.uint8))))
     recording = AslRecording(folder)
     with pytest.raises(UnusablePair, match="the image is 32x24, the rig says 64x48") as caught:
         recording.read(0)
@@ -290,9 +286,7 @@ def test_a_claim_of_an_absurd_size_costs_no_memory(tmp_path: Path) -> None:
 def test_a_recording_of_other_cameras_is_refused_as_a_whole(tmp_path: Path) -> None:
     folder = write_recording(tmp_path, [10 * MS, 20 * MS])
     write_rig(small_rig((60, 48)), folder / "rig.yaml")
-    message = (
-        "cam0/data: all images are 64x48, but the left camera of rig small has 60x48: the rig belongs to"
-    )
+    message = "cam0/data: all images are 64x48, but the left camera of rig small has 60x48: the rig belongs to"
     with pytest.raises(RecordingError, match=message):
         AslRecording(folder)
 
@@ -381,9 +375,7 @@ def test_a_listing_that_is_no_text_is_refused(tmp_path: Path) -> None:
 def test_an_empty_recording_is_refused(tmp_path: Path, camera: str) -> None:
     folder = write_recording(tmp_path, [10 * MS])
     (folder / camera / "data.csv").write_text("#timestamp [ns],filename\n", encoding="utf-8")
-    with pytest.raises(
-        RecordingError, match=rf"{camera}/data\.csv: the recording is empty: no frame is listed"
-    ):
+    with pytest.raises(RecordingError, match=rf"{camera}/data\.csv: the recording is empty: no frame is listed"):
         AslRecording(folder)
 
 
@@ -391,14 +383,10 @@ def test_a_recording_without_its_images_is_refused(tmp_path: Path) -> None:
     folder = write_recording(tmp_path, [10 * MS, 20 * MS])
     for path in (folder / "cam1" / "data").iterdir():
         path.unlink()
-    with pytest.raises(
-        RecordingError, match=r"cam1/data: none of the 2 images that data\.csv lists is there"
-    ):
+    with pytest.raises(RecordingError, match=r"cam1/data: none of the 2 images that data\.csv lists is there"):
         AslRecording(folder)
     (folder / "cam1" / "data").rmdir()
-    with pytest.raises(
-        RecordingError, match=r"cam1/data: none of the 2 images that data\.csv lists is there"
-    ):
+    with pytest.raises(RecordingError, match=r"cam1/data: none of the 2 images that data\.csv lists is there"):
         AslRecording(folder)
 
 
@@ -418,9 +406,7 @@ def test_a_recording_of_other_files_is_refused(tmp_path: Path) -> None:
 
 
 def test_a_folder_that_is_no_recording_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(
-        RecordingError, match=r"no recording: cam0/data\.csv and cam1/data\.csv missing \(EuRoC"
-    ):
+    with pytest.raises(RecordingError, match=r"no recording: cam0/data\.csv and cam1/data\.csv missing \(EuRoC"):
         AslRecording(tmp_path)
     folder = write_recording(tmp_path, [10 * MS])
     (folder / "cam1" / "data.csv").unlink()

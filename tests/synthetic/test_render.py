@@ -57,9 +57,7 @@ def test_later_layers_stand_in_front_and_the_picture_is_not_changed() -> None:
 
 def test_what_lies_outside_the_image_is_not_drawn() -> None:
     rig = default_rig((400, 300))
-    beside = Tube(
-        np.array([400.0, 0.0, 250.0]) + np.linspace(0, 10, 50)[:, None] * np.array([0.0, 1.0, 0.0]), 1.0
-    )
+    beside = Tube(np.array([400.0, 0.0, 250.0]) + np.linspace(0, 10, 50)[:, None] * np.array([0.0, 1.0, 0.0]), 1.0)
     shape = outline(beside, rig.left, RigidTransform.identity(), (0.0, 0.0, -1.0))
     np.testing.assert_array_equal(painted(levels_of(80.0), [(shape, Material(0.0))], Lens()), levels_of(80.0))
 

@@ -77,9 +77,7 @@ def test_coverage_is_that_of_the_blurred_silhouette(
     blurred = cv2.GaussianBlur(canvas, (0, 0), BLUR_PX * SUPERSAMPLING)
     # Between the two middle sub-pixels lies the pixel's centre.
     half = SUPERSAMPLING // 2
-    at_centers = sum(
-        blurred[half - a :: SUPERSAMPLING, half - b :: SUPERSAMPLING] for a in (0, 1) for b in (0, 1)
-    )
+    at_centers = sum(blurred[half - a :: SUPERSAMPLING, half - b :: SUPERSAMPLING] for a in (0, 1) for b in (0, 1))
     expected = np.asarray(at_centers) / 4
 
     u, v = np.meshgrid(np.arange(low[0], high[0]), np.arange(low[1], high[1]))

@@ -83,9 +83,7 @@ def test_noise_moves_the_axis_as_far_as_predicted() -> None:
 def test_the_streak_on_steel_lies_off_the_axis() -> None:
     needle = NeedleMotion((10.0, -40.0, 250.0), (1.0, 0.6, 0.0), Wave(70.0), diameter_mm=1.1)
     world = World(RIG, needle, lighting=STEEL, noise=NOISE_FREE, sleeve=None)
-    for levels, points_px in zip(
-        world.grey_levels(0.0), RIG.project(world.truth(0.0).centerline_mm), strict=True
-    ):
+    for levels, points_px in zip(world.grey_levels(0.0), RIG.project(world.truth(0.0).centerline_mm), strict=True):
         tangents = spline.tangents(points_px)
         normals = np.column_stack([-tangents[:, 1], tangents[:, 0]])
         at = points_px[:, None] + ACROSS_PX[:, None] * normals[:, None]
@@ -95,9 +93,7 @@ def test_the_streak_on_steel_lies_off_the_axis() -> None:
 
 def test_one_seed_is_one_world() -> None:
     def world(seed: int) -> World:
-        return World(
-            default_rig((640, 512)), NeedleMotion.random(1), Background(contrast=10.0, vessels=3), seed=seed
-        )
+        return World(default_rig((640, 512)), NeedleMotion.random(1), Background(contrast=10.0, vessels=3), seed=seed)
 
     again, first = world(5), world(5)
     again.pair(2.0)

@@ -126,9 +126,7 @@ def test_the_forms_that_eq_5_gives_as_equal_differ_by_the_determinant_of_k() -> 
 @pytest.mark.parametrize(
     ("scale", "low_px", "high_px"), [("unit_translation", 0.135, 0.145), ("unit_norm", 0.005, 0.009)]
 )
-def test_what_the_threshold_means_in_pixels(
-    lab: Recording, scale: Scale, low_px: float, high_px: float
-) -> None:
+def test_what_the_threshold_means_in_pixels(lab: Recording, scale: Scale, low_px: float, high_px: float) -> None:
     f = fundamental_matrix(lab.rig, scale)
     left_px, right_px = pinhole_pixels(lab.rig, np.array(lab.frames[0]["centerline_mm"]))
     at_px = threshold_px(f, left_px, 1e-4)
@@ -144,9 +142,7 @@ def test_what_the_threshold_means_in_pixels(
 
 @pytest.mark.parametrize("absolute", [True, False])
 @pytest.mark.parametrize("threshold", [1e-4, 1e-3])
-def test_double_loop_and_distance_map_give_the_same_pairs(
-    lab: Recording, threshold: float, absolute: bool
-) -> None:
+def test_double_loop_and_distance_map_give_the_same_pairs(lab: Recording, threshold: float, absolute: bool) -> None:
     pair, parameters = lab.pairs[0], ReferenceParameters()
     left_px = extract_centerline(pair.left.image, lab.rig.left, parameters).points_px
     right_px = extract_centerline(pair.right.image, lab.rig.right, parameters).points_px
@@ -191,9 +187,7 @@ def test_every_kth_point_is_kept(lab: Recording, k: int) -> None:
 )
 def test_eq_12_is_exact_for_exact_pairs(x_mm: float, y_mm: float, z_mm: float, tilt_rad: float) -> None:
     rig = default_rig()
-    roll = RigidTransform(
-        np.asarray(cv2.Rodrigues(np.array([0, 0, tilt_rad]))[0], dtype=np.float64), np.zeros(3)
-    )
+    roll = RigidTransform(np.asarray(cv2.Rodrigues(np.array([0, 0, tilt_rad]))[0], dtype=np.float64), np.zeros(3))
     rig = StereoRig(rig.left, rig.right, roll @ rig.right_from_left)
     points_mm = np.array([[x_mm, y_mm, z_mm]])
     left_px, right_px = pinhole_pixels(rig, points_mm)
@@ -242,9 +236,7 @@ def test_eq_12_depends_on_where_pixels_have_their_origin() -> None:
     off_px = np.array([0.3, 0.3])
     here_mm = triangulate_eq12(rig, left_px, right_px + off_px)
     there_mm = triangulate_eq12(moved, left_px, right_px + off_px + shift[:2, 2])
-    np.testing.assert_allclose(
-        triangulate_eq12(moved, left_px, right_px + shift[:2, 2]), points_mm, atol=1e-6
-    )
+    np.testing.assert_allclose(triangulate_eq12(moved, left_px, right_px + shift[:2, 2]), points_mm, atol=1e-6)
     assert np.median(np.abs(here_mm - there_mm).max(axis=1)) > 0.1
 
 
@@ -356,9 +348,7 @@ def test_the_lab_is_as_good_and_as_bad_as_measured_before(lab: Recording) -> Non
         assert track.curve is not None
         errors_mm.append(rms(off_polyline(track.curve.points_mm, np.array(truth["centerline_mm"]))))
         found.append(track.quality.coverage)
-        found_at_1e_3.append(
-            track_reference(pair, lab.rig, ReferenceParameters(threshold=1e-3)).quality.coverage
-        )
+        found_at_1e_3.append(track_reference(pair, lab.rig, ReferenceParameters(threshold=1e-3)).quality.coverage)
     assert 0.2 < float(np.median(errors_mm)) < 0.5
     assert 0.15 < float(np.median(np.array(found))) < 0.4
     assert float(np.median(np.array(found_at_1e_3))) > 0.9

@@ -52,9 +52,7 @@ class StereoCalibration:
     rejected: tuple[RejectedView, ...]
 
 
-def calibrate_stereo(
-    views: Sequence[BoardView], board: Checkerboard, size_px: tuple[int, int]
-) -> StereoCalibration:
+def calibrate_stereo(views: Sequence[BoardView], board: Checkerboard, size_px: tuple[int, int]) -> StereoCalibration:
     """Both cameras, for images of size_px (width, height), each with the distortion k1 k2 p1 p2 k3.
 
     A view is rejected, with the reason, where a picture lacks the board, the order of corners stays
@@ -80,9 +78,7 @@ def calibrate_stereo(
             _require_enough(pairs, rejected)
             solution = _solve(pairs, board, size_px)
     except (cv2.error, ValueError) as error:
-        raise CalibrationError(
-            f"{len(pairs)} views do not determine the cameras: {_REMEDY} ({error})"
-        ) from error
+        raise CalibrationError(f"{len(pairs)} views do not determine the cameras: {_REMEDY} ({error})") from error
     return StereoCalibration(
         solution.rig,
         solution.rms_px,
@@ -120,9 +116,7 @@ def _missing(view: BoardView, board: Checkerboard) -> str:
 def _require_enough(pairs: Sequence[_Pair], rejected: Sequence[RejectedView]) -> None:
     if len(pairs) < MIN_VIEWS:
         reasons = "".join(f"; view {view.index}: {view.reason}" for view in rejected)
-        raise CalibrationError(
-            f"{len(pairs)} usable views of the board are fewer than {MIN_VIEWS}: {_REMEDY}{reasons}"
-        )
+        raise CalibrationError(f"{len(pairs)} usable views of the board are fewer than {MIN_VIEWS}: {_REMEDY}{reasons}")
 
 
 def _worst_is_an_outlier(view_rms_px: Float) -> str:
@@ -162,8 +156,7 @@ def _in_one_order(
     different = remaining_px[(chosen != chosen[best]).mean(axis=1) > 0.5]
     if len(different) and different.min() < _CLEARLY_BETTER * remaining_px[best]:
         raise CalibrationError(
-            "the board looks the same after a turn, and the views are too much alike to tell which was made: "
-            f"{_REMEDY}"
+            f"the board looks the same after a turn, and the views are too much alike to tell which was made: {_REMEDY}"
         )
     ordered, out_of_order = [], []
     for pair, view_errors_px, turn_index in zip(pairs, by_answer[best], chosen[best], strict=True):
@@ -205,9 +198,7 @@ class _CameraSolution:
     camera_from_board: tuple[RigidTransform, ...]
 
 
-def _solve_camera(
-    corners_px: Sequence[Float], board: Checkerboard, size_px: tuple[int, int]
-) -> _CameraSolution:
+def _solve_camera(corners_px: Sequence[Float], board: Checkerboard, size_px: tuple[int, int]) -> _CameraSolution:
     board_points, image_points = _for_opencv([board.points_mm] * len(corners_px)), _for_opencv(corners_px)
     _, matrix, distortion, rotations, translations = cv2.calibrateCamera(
         board_points, image_points, size_px, np.eye(3), np.zeros(5), criteria=_UNTIL

@@ -27,9 +27,7 @@ __all__ = [
 ]
 
 
-def write_pictures(
-    track: NeedleTrack, pair: StereoPair, rig: StereoRig, folder: Path | str, stem: str
-) -> list[Path]:
+def write_pictures(track: NeedleTrack, pair: StereoPair, rig: StereoRig, folder: Path | str, stem: str) -> list[Path]:
     """Write <stem>-overlay.png, <stem>-distance-map.png and <stem>-shape.png, with or without a shape.
 
     Makes the folder where there is none. Raises NeedletrackError where a file cannot be written.

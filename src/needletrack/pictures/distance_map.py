@@ -113,9 +113,7 @@ def distance_map_figure(track: NeedleTrack, rig: StereoRig) -> Page:
     """
     found = distance_map(track, rig)
     page = Page(WIDTH_PX, HEIGHT_PX if found is not None else EMPTY_PX)
-    page.write_heading(
-        "Epipolar distance map", "every left point against every right point, undistorted px", track
-    )
+    page.write_heading("Epipolar distance map", "every left point against every right point, undistorted px", track)
     if found is None:
         page.write(WIDTH_PX / 2, page.height_px - 80, "no centerline in both views", 26, MUTED, "center")
         return page
@@ -147,12 +145,8 @@ def _draw_map(page: Page, found: DistanceMap, pairs: Correspondences | None, det
     axes.set_ylabel(f"along the {of} centerline, right view, px from the base", color=TEXT, fontsize=20)
     handles = [Line2D([], [], color=TEXT, linewidth=2, label="1 px")]
     if pairs is not None and len(pairs.left_undistorted_px):
-        axes.plot(
-            *found.place(pairs), linestyle="none", marker="o", markersize=3.6, color=_CHAIN, markeredgewidth=0
-        )
-        handles.append(
-            Line2D([], [], linestyle="none", marker="o", markersize=9, color=_CHAIN, label="matched pairs")
-        )
+        axes.plot(*found.place(pairs), linestyle="none", marker="o", markersize=3.6, color=_CHAIN, markeredgewidth=0)
+        handles.append(Line2D([], [], linestyle="none", marker="o", markersize=9, color=_CHAIN, label="matched pairs"))
     axes.set(xlim=(0, left[-1]), ylim=(0, right[-1]))
     axes.legend(
         handles=handles,

@@ -151,9 +151,7 @@ def _write_legend(page: Page, track: NeedleTrack, pair: StereoPair) -> None:
     )
     handles: list[Line2D] = []
     if track.curve is not None:
-        handles += [
-            Line2D([], [], color=SEEN_COLOR[n], linewidth=5, label=SEEN_MEANING[n]) for n in (2, 1, 0)
-        ]
+        handles += [Line2D([], [], color=SEEN_COLOR[n], linewidth=5, label=SEEN_MEANING[n]) for n in (2, 1, 0)]
     if track.evidence.left is not None or track.evidence.right is not None:
         handles.append(Line2D([], [], color=DETECTED, alpha=0.6, linewidth=9, label="detected"))
     if track.base is not None:
@@ -166,9 +164,7 @@ def _write_legend(page: Page, track: NeedleTrack, pair: StereoPair) -> None:
 
 def _marker(shape: str, color: str, label: str) -> Line2D:
     """A hollow marker for the legend."""
-    return Line2D(
-        [], [], linestyle="none", marker=shape, markersize=13, mfc="none", mec=color, mew=3, label=label
-    )
+    return Line2D([], [], linestyle="none", marker=shape, markersize=13, mfc="none", mec=color, mew=3, label=label)
 
 
 def _inset_corner(track: NeedleTrack, views: tuple[_View, _View]) -> _Corner:

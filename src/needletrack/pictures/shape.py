@@ -146,9 +146,7 @@ def _draw_side(axes: Axes, scene: _Scene, side: _Side) -> None:
     outline = np.concatenate([points + across, (points - across)[::-1]])
     axes.fill(*outline.T, color=TEXT, alpha=0.22, linewidth=0)
     segments = np.stack([points[:-1], points[1:]], axis=1)
-    axes.add_collection(
-        LineCollection(list(segments), colors=scene.segment_colors, linewidths=4, capstyle="round")
-    )
+    axes.add_collection(LineCollection(list(segments), colors=scene.segment_colors, linewidths=4, capstyle="round"))
     if scene.dotted:
         x, y = points.T
         axes.scatter(x, y, s=110, c=scene.sigma_mm, cmap=_COLORS, norm=scene.norm, edgecolors=PAGE, zorder=3)
@@ -202,9 +200,7 @@ def _draw_perspective(page: Page, x: float, y: float, scene: _Scene) -> None:
     lines = [[(v, y1, z0), (v, y1, z1), (v, y0, z1)] for v in ticks[0]]
     lines += [[(x0, v, z0), (x0, v, z1), (x1, v, z1)] for v in ticks[1]]
     lines += [[(x0, y0, v), (x0, y1, v), (x1, y1, v)] for v in ticks[2]]
-    axes.add_collection3d(
-        Line3DCollection([_upright(np.array(line)) for line in lines], colors=RULE, linewidths=1)
-    )
+    axes.add_collection3d(Line3DCollection([_upright(np.array(line)) for line in lines], colors=RULE, linewidths=1))
     for axis, wall in ((1, y1), (2, z1), (0, x0)):
         shadow = scene.points_mm.copy()
         shadow[:, axis] = wall
@@ -213,9 +209,7 @@ def _draw_perspective(page: Page, x: float, y: float, scene: _Scene) -> None:
     axes.add_collection3d(Poly3DCollection(_tube(scene), facecolors=TEXT, alpha=0.12, linewidths=0))
     points = _upright(scene.points_mm)
     segments = np.stack([points[:-1], points[1:]], axis=1)
-    axes.add_collection3d(
-        Line3DCollection(segments, colors=scene.segment_colors, linewidths=4.5, capstyle="round")
-    )
+    axes.add_collection3d(Line3DCollection(segments, colors=scene.segment_colors, linewidths=4.5, capstyle="round"))
     if scene.base_mm is not None:
         axes.plot(*_upright(scene.base_mm), marker="s", markersize=11, color=BASE, markeredgecolor=PAGE)
     if scene.tip_mm is not None and scene.arrow_mm is not None:
@@ -249,9 +243,7 @@ def _label_edges(axes: Any, scene: _Scene, ticks: list[Float]) -> None:
     places += [(x0 - out, v, z0 - 0.5 * out) for v in ticks[1]]
     places += [(x1 + out, y1 + 0.5 * out, v) for v in ticks[2]]
     for value, at in zip(np.concatenate(ticks), places, strict=True):
-        axes.text(
-            *_upright(np.array(at)), number(value, 0), fontsize=16, color=MUTED, ha="center", va="center"
-        )
+        axes.text(*_upright(np.array(at)), number(value, 0), fontsize=16, color=MUTED, ha="center", va="center")
     middle = (scene.low_mm + scene.high_mm) / 2
     for text, at in (
         ("x, mm", (middle[0], y1 + 1.2 * out, z0 - 2.6 * out)),

@@ -146,9 +146,7 @@ class WireBase(WirePart):
     @classmethod
     def from_pose(cls, base: BasePose) -> Self:
         """The wire's form of a base pose."""
-        return cls(
-            position_mm=_rounded(base.position_mm, MM_DIGITS), direction=_rounded(base.direction, UNIT_DIGITS)
-        )
+        return cls(position_mm=_rounded(base.position_mm, MM_DIGITS), direction=_rounded(base.direction, UNIT_DIGITS))
 
     @model_validator(mode="after")
     def _has_unit_vectors(self) -> Self:
@@ -221,13 +219,9 @@ class TrackMessage(WirePart):
     curvature_per_mm: tuple[float, ...] | None = Field(description="per point: 1 / radius of curvature")
     length_mm: NotNegative | None = Field(description="along the arc, base to tip")
     tip: WireTip | None = Field(description="the free end; never null when ok")
-    base: WireBase | None = Field(
-        description="where the needle leaves its sleeve or the image; null if unknown"
-    )
+    base: WireBase | None = Field(description="where the needle leaves its sleeve or the image; null if unknown")
     quality: WireQuality = Field(description="how well the shape explains the images")
-    timing_ms: Mapping[str, float] | None = Field(
-        description="stage: milliseconds; null in a deterministic replay"
-    )
+    timing_ms: Mapping[str, float] | None = Field(description="stage: milliseconds; null in a deterministic replay")
     latency_ms: float | None = Field(
         description="exposure (live) or release (replay) to publish; null if unknown or deterministic"
     )
@@ -304,12 +298,8 @@ class TrackMessage(WirePart):
                 raise ValueError("without centerline_mm there is no shape, length, tip or base")
         elif len(self.centerline_mm) < 2:
             raise ValueError("centerline_mm has fewer than 2 points")
-        elif self.length_mm is None or any(
-            part is None or len(part) != len(self.centerline_mm) for part in shape
-        ):
-            raise ValueError(
-                "sigma_mm, seen, curvature_per_mm and length_mm must go with centerline_mm, one per point"
-            )
+        elif self.length_mm is None or any(part is None or len(part) != len(self.centerline_mm) for part in shape):
+            raise ValueError("sigma_mm, seen, curvature_per_mm and length_mm must go with centerline_mm, one per point")
         if self.status is Status.OK and (self.centerline_mm is None or self.tip is None or self.reasons):
             raise ValueError("an ok track has a shape, a tip and no reasons")
         if self.status is Status.DEGRADED and (self.centerline_mm is None or not self.reasons):
@@ -344,9 +334,7 @@ class StatusMessage(WirePart):
     source: Source = Field(description="cameras, or a recording")
     config_digest: str = Field(description="equal digests mean equal configurations")
     rig_digest: str = Field(description="equal digests mean equal calibrations")
-    published_at_ns: int | None = Field(
-        description="Unix time of the heartbeat; null in a deterministic replay"
-    )
+    published_at_ns: int | None = Field(description="Unix time of the heartbeat; null in a deterministic replay")
     state: ServiceState = Field(description="stopping: a clean stop, the token goes next")
     uptime_s: NotNegative | None = Field(description="null in a deterministic replay")
     heartbeat_s: Annotated[float, Field(gt=0)] = Field(
@@ -389,8 +377,7 @@ class StatusMessage(WirePart):
             uptime_s=None if run.deterministic else _rounded_or_none(uptime_s, 3),
             heartbeat_s=heartbeat_s,
             last_sequence=last_sequence,
-            calibration=calibration
-            or WireCalibration(calibrated_at=None, age_days=None, reprojection_rms_px=None),
+            calibration=calibration or WireCalibration(calibrated_at=None, age_days=None, reprojection_rms_px=None),
             rates=rates or WireRates(pairs_per_s=0.0, tracks_per_s={}),
             dropped=_counted(dropped or {}),
             counters=dict(sorted((counters or {}).items())),

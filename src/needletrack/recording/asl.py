@@ -128,9 +128,7 @@ class _Camera:
         """RecordingError where no image is there, or none has the size that the rig says."""
         there = [frame for frame in self.listed if self.has(frame)]
         if not there:
-            raise RecordingError(
-                f"{self.data}: none of the {len(self.listed)} images that data.csv lists is there"
-            )
+            raise RecordingError(f"{self.data}: none of the {len(self.listed)} images that data.csv lists is there")
         wanted = getattr(rig, self.side).size_px
         sizes: set[tuple[int, int]] = set()
         for frame in there:  # as a rule the first one fits, and no other is opened
@@ -162,9 +160,7 @@ class _Camera:
             elif not self.has(frame):
                 losses.append(Loss(DropReason.MISSING_IMAGE, frame.path, "there is no such image", before))
             else:
-                losses.append(
-                    Loss(unpaired, frame.path, "the other camera has no frame of this instant", before)
-                )
+                losses.append(Loss(unpaired, frame.path, "the other camera has no frame of this instant", before))
         return losses
 
 
@@ -175,9 +171,7 @@ def _image_or_fault(frame: ListedFrame, size_px: tuple[int, int]) -> Image | Unu
         return error
 
 
-def _loss_in_pair(
-    frame: ListedFrame, found: Image | UnusableImage, unpaired: DropReason, before: int
-) -> Loss:
+def _loss_in_pair(frame: ListedFrame, found: Image | UnusableImage, unpaired: DropReason, before: int) -> Loss:
     if isinstance(found, UnusableImage):
         return Loss(found.reason, frame.path, found.fault, before)
     return Loss(unpaired, frame.path, "its partner is lost", before)
@@ -188,9 +182,7 @@ def _require_layout(folder: Path) -> None:
         raise RecordingError(f"{folder}: there is no such recording")
     if not folder.is_dir():
         raise RecordingError(f"{folder}: a file, but a recording is a folder ({LAYOUT})")
-    missing = [
-        f"{camera}/data.csv" for camera in ("cam0", "cam1") if not (folder / camera / "data.csv").is_file()
-    ]
+    missing = [f"{camera}/data.csv" for camera in ("cam0", "cam1") if not (folder / camera / "data.csv").is_file()]
     if missing:
         raise RecordingError(f"{folder}: no recording: {' and '.join(missing)} missing ({LAYOUT})")
 
@@ -208,9 +200,7 @@ def _read_listing(path: Path) -> list[ListedFrame]:
             continue
         stamp, _, name = (part.strip() for part in line.partition(","))
         if not (stamp.isascii() and stamp.isdecimal() and int(stamp) <= _GREATEST_STAMP):
-            raise RecordingError(
-                f"{path}, line {number}: {stamp!r} is no stamp in whole nanoseconds: {line!r}"
-            )
+            raise RecordingError(f"{path}, line {number}: {stamp!r} is no stamp in whole nanoseconds: {line!r}")
         if not name or "," in name or name != Path(name).name:
             raise RecordingError(f"{path}, line {number}: {name!r} is no name of a file in data/: {line!r}")
         frames.append(ListedFrame(path.parent / "data" / name, int(stamp)))

@@ -28,9 +28,7 @@ def in_order(stamps_ns: Sequence[int]) -> list[int]:
     return kept
 
 
-def pair_by_stamp(
-    left_ns: Sequence[int], right_ns: Sequence[int], tolerance_ns: int
-) -> list[tuple[int, int]]:
+def pair_by_stamp(left_ns: Sequence[int], right_ns: Sequence[int], tolerance_ns: int) -> list[tuple[int, int]]:
     """Indices (left, right) of frames that are each other's nearest and at most tolerance_ns apart, in order.
 
     Both sequences strictly increase. A frame that is missing on either side costs that pair and no other.

@@ -51,9 +51,7 @@ def read_gray(path: Path, size_px: tuple[int, int]) -> Image:
             header = file.read(_HEADER_BYTES)
             size = _size_in(header)
             if size is None:
-                raise UnusableImage(
-                    path, DropReason.UNREADABLE_IMAGE, "no PNG, or not even its header is whole"
-                )
+                raise UnusableImage(path, DropReason.UNREADABLE_IMAGE, "no PNG, or not even its header is whole")
             if size != size_px:
                 fault = f"the image is {size[0]}x{size[1]}, the rig says {width}x{height}"
                 raise UnusableImage(path, DropReason.WRONG_SIZE, fault)

@@ -55,9 +55,7 @@ class ReplaySource:
             raise RecordingError(f"start and end count from 0 and are not negative: {start}, {end}")
         if not self._range:
             wanted = f"{start} to {'the last' if end is None else end}"
-            raise RecordingError(
-                f"{recording.folder}: no pair from {wanted}: the recording has {len(recording)}"
-            )
+            raise RecordingError(f"{recording.folder}: no pair from {wanted}: the recording has {len(recording)}")
         if loop < 1:
             raise RecordingError(f"a recording is played once or more, not {loop} times")
         if loop > 1 and len(self._range) < 2:

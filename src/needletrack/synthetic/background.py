@@ -59,9 +59,7 @@ def plane_levels(
     """Grey levels (rows, columns) of a camera's view of the plane z = distance_mm in the world frame."""
     width, height = camera.size_px
     columns, rows = -(-width // STRIDE_PX), -(-height // STRIDE_PX)
-    u, v = np.meshgrid(
-        (np.arange(columns) + 0.5) * STRIDE_PX - 0.5, (np.arange(rows) + 0.5) * STRIDE_PX - 0.5
-    )
+    u, v = np.meshgrid((np.arange(columns) + 0.5) * STRIDE_PX - 0.5, (np.arange(rows) + 0.5) * STRIDE_PX - 0.5)
     rays = np.column_stack([camera.normalize(np.column_stack([u.ravel(), v.ravel()])), np.ones(u.size)])
     world_from_camera = camera_from_world.inverse()
     directions = rays @ world_from_camera.rotation.T

@@ -54,9 +54,7 @@ class NeedleShape:
         n = len(self.points_mm)
         object.__setattr__(self, "points_mm", frozen_array(self.points_mm, (n, 3), "points_mm"))
         object.__setattr__(self, "tangents", frozen_array(self.tangents, (n, 3), "tangents"))
-        object.__setattr__(
-            self, "curvature_per_mm", frozen_array(self.curvature_per_mm, (n,), "curvature_per_mm")
-        )
+        object.__setattr__(self, "curvature_per_mm", frozen_array(self.curvature_per_mm, (n,), "curvature_per_mm"))
         object.__setattr__(self, "base_mm", frozen_array(self.base_mm, (3,), "base_mm"))
         object.__setattr__(self, "base_direction", frozen_array(self.base_direction, (3,), "base_direction"))
 

@@ -153,9 +153,7 @@ def outline(tube: Tube, camera: Camera, camera_from_world: RigidTransform, light
     tangents = spline.tangents(axis_px)
     picture_normal = np.column_stack([-tangents[:, 1], tangents[:, 0]])
     edges = [
-        ((camera.project(axis + radius * (sign * normal - sine * away)) - axis_px) * picture_normal).sum(
-            axis=1
-        )
+        ((camera.project(axis + radius * (sign * normal - sine * away)) - axis_px) * picture_normal).sum(axis=1)
         for sign in (1.0, -1.0)
     ]
     half_width = (edges[0] - edges[1]) / 2
@@ -191,9 +189,7 @@ def outline(tube: Tube, camera: Camera, camera_from_world: RigidTransform, light
 
 
 def _strip(across: Float, half_width: Side, low: Side, high: Side, blur_px: float) -> Float:
-    return np.asarray(
-        ndtr((across - low * half_width) / blur_px) - ndtr((across - high * half_width) / blur_px)
-    )
+    return np.asarray(ndtr((across - low * half_width) / blur_px) - ndtr((across - high * half_width) / blur_px))
 
 
 def _capped(cap: Cap, beyond: Float, across: Float, low: Side, high: Side, blur_px: float) -> Float:

@@ -39,9 +39,7 @@ class Lighting:
 
 
 DARK_ON_LIGHT = Lighting(200.0, Material(35.0), Material(25.0), Material(120.0, 60.0, 0.4), Material(130.0))
-LIGHT_ON_DARK = Lighting(
-    50.0, Material(235.0), Material(90.0, 60.0, 0.3), Material(130.0, 50.0, 0.4), Material(25.0)
-)
+LIGHT_ON_DARK = Lighting(50.0, Material(235.0), Material(90.0, 60.0, 0.3), Material(130.0, 50.0, 0.4), Material(25.0))
 STEEL = Lighting(115.0, Material(55.0, 170.0), Material(22.0), Material(120.0, 60.0, 0.4), Material(75.0))
 
 
@@ -83,9 +81,7 @@ class Truth:
         n = len(self.centerline_mm)
         object.__setattr__(self, "centerline_mm", frozen_array(self.centerline_mm, (n, 3), "centerline_mm"))
         object.__setattr__(self, "tangents", frozen_array(self.tangents, (n, 3), "tangents"))
-        object.__setattr__(
-            self, "curvature_per_mm", frozen_array(self.curvature_per_mm, (n,), "curvature_per_mm")
-        )
+        object.__setattr__(self, "curvature_per_mm", frozen_array(self.curvature_per_mm, (n,), "curvature_per_mm"))
         object.__setattr__(self, "visible", frozen_array(self.visible, (2, n), "visible", np.bool_))
 
     @property
@@ -202,9 +198,7 @@ class World:
         ]
         if self.lens.vignetting == 0:
             return pictures
-        return [
-            picture * transmission for picture, transmission in zip(pictures, self._transmission, strict=True)
-        ]
+        return [picture * transmission for picture, transmission in zip(pictures, self._transmission, strict=True)]
 
     @cached_property
     def _transmission(self) -> list[GreyLevels]:
@@ -215,9 +209,7 @@ class World:
         rng = np.random.default_rng((self.seed, _BACKGROUND_STREAM))
         texture = Texture.random(rng, self.background.contrast)
         distance_mm = self.background.distance_mm
-        clutter = [
-            (vessel, self.lighting.vessel) for vessel in vessels(rng, self.background.vessels, distance_mm)
-        ]
+        clutter = [(vessel, self.lighting.vessel) for vessel in vessels(rng, self.background.vessels, distance_mm)]
         return [
             painted(
                 plane_levels(camera, pose, self.lighting.background_level, texture, distance_mm),

@@ -98,6 +98,13 @@ def test_a_prediction_too_far_beside_sees_nothing_once_the_diameter_is_known() -
     assert not in_left(scene("dark"), 15.0, None).firm.any()
 
 
+def test_edges_further_apart_than_the_needle_are_not_its_own() -> None:
+    wide = seen_at(replace(WORLDS["dark"], needle=replace(ARC, diameter_mm=1.5)))
+    assert np.isfinite(in_left(wide, diameter_mm=1.5).width_px[INNER]).all()
+    # 8.4 px where 5 are expected, and a blur of one may be added.
+    assert np.isnan(in_left(wide, diameter_mm=0.9).width_px[INNER]).all()
+
+
 def streaked(toward_light_deg: float) -> World:
     """Steel under a light that puts the streak so many degrees round the needle from where the camera looks at it."""
     turn = np.radians(2 * toward_light_deg)

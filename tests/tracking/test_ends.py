@@ -160,11 +160,12 @@ def crossed(at: int, length_mm: float, level: float = 40.0) -> Float:
     [
         (np.stack([stepped(50), np.full(N, 200.0)]), stepped(50)),
         (stepped(50), stepped(80)),
+        (np.stack([stepped(50), stepped(50, 255.0)]),) * 2,
         (stepped(50, 196.0), stepped(50, 196.0)),
         (crossed(100, 3.0), crossed(100, 3.0)),
         (crossed(60, 3.0), crossed(90, 3.0)),
     ],
-    ids=["one side", "two places", "too faint", "a rod across", "a vessel behind"],
+    ids=["one side", "two places", "darker and brighter", "too faint", "a rod across", "a vessel behind"],
 )
 def test_what_else_changes_beside_the_needle_is_no_sleeve(left_flank: Float, right_flank: Float) -> None:
     firm = between(30, 160)

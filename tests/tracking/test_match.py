@@ -113,6 +113,25 @@ def test_pairs_keep_the_order_along_both_lines_and_lie_on_the_needle(
     assert (off_mm * found.confidence).max() < WORST_AT_RIGHT_ANGLES_MM
 
 
+@pytest.mark.parametrize("turn_deg", [8.0, 15.0, 40.0, 90.0])
+def test_the_zigzag_of_a_skeleton_does_not_turn_the_order(turn_deg: float) -> None:
+    # Half a pixel of noise makes an epipolar line cross a line that runs nearly along it many times, to and fro.
+    turn = np.radians(turn_deg)
+    points_mm = curve(NeedleMotion((-15.0, -15.0, 250.0), (float(np.cos(turn)), float(np.sin(turn)), 0.1), Wave(50.0)))
+    rng = np.random.default_rng(7)
+    left, right = (
+        Centerline(line.points_px[::8] + rng.normal(0.0, 0.5, (len(line.points_px[::8]), 2)), line.width_px[::8])
+        for line in seen(points_mm)
+    )
+    (found,) = matched((left, right))
+    # Places are told to the nearest point of the zigzag.
+    for places in along_both(found):
+        assert np.diff(places).min() > -PARAMETERS.step_px
+    # Across the lines, and with what half a pixel in both views does along them.
+    off_mm = off_polyline(found.points_mm, points_mm)
+    assert np.median(off_mm * found.confidence) < 0.5 * np.sqrt(2) * 250.0**2 / (68.0 * RIG.left.focal_px)
+
+
 def share_along_epipolar_lines(points_mm: Float, angle_deg: float = 10.0) -> float:
     lines = epipolar_lines(RIG.fundamental, RIG.left.undistort(RIG.left.project(points_mm)))
     along = spline.tangents(RIG.right.undistort(RIG.project(points_mm)[1]))
@@ -196,8 +215,12 @@ def test_vessels_do_not_lend_each_other_their_partners() -> None:
     (phantom,) = matched((seen(one)[0], seen(other)[1]))
     assert inside(WORKSPACE, phantom.points_mm).all()
     assert phantom.length_mm > 40.0
-    with pytest.raises(NeedleNotFound):
-        matched(seen(one), seen(other))
+    # However narrow the workspace: both vessels have their own partners outside it.
+    low, high = phantom.points_mm.min(axis=0) - 1.0, phantom.points_mm.max(axis=0) + 1.0
+    x, y, z = (Range(min=float(a), max=float(b)) for a, b in zip(low, high, strict=True))
+    for workspace in (WORKSPACE, Workspace(x_mm=x, y_mm=y, z_mm=z)):
+        with pytest.raises(NeedleNotFound):
+            matched(seen(one), seen(other), workspace=workspace)
 
 
 def test_each_line_is_offered_with_its_own_partner() -> None:
@@ -216,6 +239,14 @@ def test_the_longer_of_two_needles_comes_first() -> None:
     candidates = matched(seen(short), seen(long))
     assert off_polyline(candidates[0].points_mm, long).max() < 0.01
     assert candidates[0].length_mm > candidates[1].length_mm
+
+
+def test_a_candidate_is_worth_what_fixes_its_depth() -> None:
+    across = curve(NeedleMotion((0.0, -20.0, 250.0), (0.0, 1.0, 0.0), Wave(40.0)))
+    slanted = curve(NeedleMotion((-15.0, -5.0, 250.0), (1.0, 0.2, 0.0), Wave(40.0)))
+    (firm,), (loose,) = matched(seen(across)), matched(seen(slanted))
+    assert loose.confidence.max() < 0.3
+    assert loose.score < 0.5 * firm.score
 
 
 def test_without_lines_there_is_no_candidate() -> None:
@@ -245,6 +276,11 @@ def test_what_is_too_short_to_be_a_needle_is_not_offered() -> None:
 def test_the_workspace_decides() -> None:
     points_mm = curve(ARC)
     assert matched(seen(points_mm), workspace=Workspace(z_mm=Range(min=240.0, max=270.0)))
+    # Of a needle that is partly outside, only what is inside is matched.
+    part = Workspace(z_mm=Range(min=240.0, max=float(np.percentile(points_mm[:, 2], 70))))
+    (found,) = matched(seen(points_mm), workspace=part)
+    assert inside(part, found.points_mm).all()
+    assert found.length_mm == pytest.approx(0.7 * 68.0, abs=3.0)
     for elsewhere in (
         Workspace(z_mm=Range(min=290.0, max=310.0)),
         Workspace(x_mm=Range(min=60.0, max=90.0)),

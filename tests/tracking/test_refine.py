@@ -100,6 +100,28 @@ def test_from_the_pair_before() -> None:
     check(found, scene("dark"))
 
 
+def test_each_view_places_the_tip_by_itself() -> None:
+    # The last 1.5 mm of the needle are painted over in the right picture.
+    shown = scene("dark")
+    left, right = shown.images
+    truth = shown.truth
+    painted = right.copy()
+    from_px, to_px = RIG.project(
+        np.stack([truth.tip_mm - 1.5 * truth.tip_direction, truth.tip_mm + truth.tip_direction])
+    )[1]
+    along = (to_px - from_px) / np.linalg.norm(to_px - from_px)
+    y, x = np.indices(painted.shape)
+    ahead = (x - from_px[0]) * along[0] + (y - from_px[1]) * along[1]
+    aside = np.abs((y - from_px[1]) * along[0] - (x - from_px[0]) * along[1])
+    painted[(ahead > 0) & (ahead < np.linalg.norm(to_px - from_px)) & (aside < 6)] = 200
+    found = refine((left, painted), RIG, truth.centerline_mm, models())
+    left_px, right_px = (px[0] for px in RIG.project(truth.tip_mm[None]))
+    assert np.linalg.norm(found.tip_px[0] - left_px) < 0.4 * 5.6
+    # Of the cone its thick end is left, whose taper points to where the apex was: it is found between the two.
+    assert 0.2 * 5.6 < (right_px - found.tip_px[1]) @ along < 1.7 * 5.6
+    assert found.tip.each_mm[0] - found.tip.each_mm[1] > 0.2
+
+
 NO_SLEEVE = World(RIG, NeedleMotion((8.0, -70.0, 250.0), (0.08, 1.0, 0.05), Wave(95.0)), BEHIND, sleeve=None)
 
 

@@ -32,7 +32,10 @@ class Terminal(io.StringIO):
 
 
 def test_the_first_ctrl_c_stops_and_the_second_ends() -> None:
-    before = signal.getsignal(signal.SIGINT)
+    inherited = signal.getsignal(signal.SIGINT)
+    # A job in the background inherits an ignored SIGINT; this is about one in the foreground.
+    before = signal.default_int_handler
+    signal.signal(signal.SIGINT, before)
     with Interruption() as interruption:
         assert interruption.exit_code == 0
         assert not interruption.stop.is_set()
@@ -42,6 +45,7 @@ def test_the_first_ctrl_c_stops_and_the_second_ends() -> None:
         with pytest.raises(KeyboardInterrupt):
             signal.raise_signal(signal.SIGINT)
     assert signal.getsignal(signal.SIGINT) is before
+    signal.signal(signal.SIGINT, inherited)
 
 
 def test_a_service_manager_stops_it_too() -> None:

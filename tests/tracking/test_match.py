@@ -113,7 +113,7 @@ def test_pairs_keep_the_order_along_both_lines_and_lie_on_the_needle(
     assert (off_mm * found.confidence).max() < WORST_AT_RIGHT_ANGLES_MM
 
 
-@pytest.mark.parametrize("turn_deg", [8.0, 15.0, 40.0, 90.0])
+@pytest.mark.parametrize("turn_deg", [12.0, 20.0, 40.0, 90.0])
 def test_the_zigzag_of_a_skeleton_does_not_turn_the_order(turn_deg: float) -> None:
     # Half a pixel of noise makes an epipolar line cross a line that runs nearly along it many times, to and fro.
     turn = np.radians(turn_deg)

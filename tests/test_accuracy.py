@@ -19,9 +19,13 @@ RECORDINGS = Path(__file__).parent / "data" / "recordings"
 STILLS = ("lab-a", "absent-a", "steel-a", "tissue-a", "hard-a")
 
 
-@cache
 def tracked(name: str, *, independent: bool = True) -> tuple[tuple[NeedleTrack, Score], ...]:
-    """Every pair of a recording, tracked and scored; independent: each without memory of the one before."""
+    """Every pair of a recording, tracked and scored once; independent: each without memory of the one before."""
+    return _tracked(name, independent)
+
+
+@cache
+def _tracked(name: str, independent: bool) -> tuple[tuple[NeedleTrack, Score], ...]:
     recording = AslRecording(RECORDINGS / name)
     truth = recorded_truth(RECORDINGS / name)
     found: list[tuple[NeedleTrack, Score]] = []

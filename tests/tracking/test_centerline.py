@@ -77,7 +77,7 @@ def test_a_drawn_needle_is_the_longest_line(name: str) -> None:
         assert np.linalg.norm(np.diff(line.points_px, axis=0), axis=1).max() < 2 * REDUCED_PX
 
 
-@settings(max_examples=25)
+@settings(max_examples=15)
 @given(st.floats(0.0, np.pi), st.floats(6.0, 9.0), st.booleans())
 def test_a_straight_line_is_one_line_whatever_its_direction(angle: float, width_px: float, is_dark: bool) -> None:
     half = 200.0 * np.array([np.cos(angle), np.sin(angle)])

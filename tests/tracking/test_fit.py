@@ -153,7 +153,7 @@ def normalized_squares(
 
 
 DOWN, SLANTED = (0.1, 1.0, 0.12), (1.0, 0.5, 0.2)
-SEEDS = 40
+SEEDS = 30
 
 
 @pytest.mark.parametrize("direction", [DOWN, SLANTED])

@@ -92,7 +92,7 @@ def needles(draw: st.DrawFn) -> NeedleMotion:
     )
 
 
-@settings(max_examples=60)
+@settings(max_examples=40)
 @given(needles(), st.booleans(), st.booleans())
 def test_pairs_keep_the_order_along_both_lines_and_lie_on_the_needle(
     motion: NeedleMotion, left_turned: bool, right_turned: bool

@@ -100,6 +100,15 @@ def test_a_streak_inside_has_no_say(streak_px: float) -> None:
         np.testing.assert_allclose((low + high) / 2, 0.0, atol=0.01)
 
 
+@pytest.mark.parametrize("streak_px", [0.0, 0.4, 0.8])
+def test_an_edge_beside_a_streak_owns_up_to_it(streak_px: float) -> None:
+    # Brighter than the background by half of what the steel is darker: the rims' edges lie outside the needle's.
+    streak = silhouette_of(needle(-80.0) + 400.0 * band(streak_px - 0.4, streak_px + 0.4))
+    for edge_px, sigma_px, true_px in zip(streak.edges_px, streak.sigma_px, (-WIDTH_PX / 2, WIDTH_PX / 2), strict=True):
+        assert np.abs(edge_px - true_px).max() < 2 * np.median(sigma_px)
+    assert silhouette_of(needle(-80.0)).sigma_px.max() < 0.1
+
+
 @pytest.mark.parametrize("streak_px", [-1.2, 1.2])
 def test_a_streak_that_swallows_a_rim_shows_by_the_width(streak_px: float) -> None:
     # The rim is narrower than the blur: what is left of it is a shoulder, and the edge found lies behind the streak.

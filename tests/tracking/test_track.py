@@ -517,6 +517,26 @@ def test_a_needle_that_leaps_is_found_and_the_leap_is_told() -> None:
     assert track_pair(elsewhere.pair, RIG, None, found).status is Status.OK
 
 
+@pytest.mark.parametrize(
+    ("gates", "pairs"),
+    [({"max_reprojection_rms_px": 1e-6}, 10), ({"max_sigma_mm": 1e-6}, 30)],
+    ids=["in doubt", "weak"],
+)
+def test_a_track_that_stays_weak_is_searched_for_anew(gates: dict[str, float], pairs: int) -> None:
+    strict = TrackingParameters.model_validate({"gates": gates})
+    weak = track_pair(scene("dark").pair, RIG, strict)
+    assert weak.status is Status.DEGRADED
+    followed = track_pair(scene("dark").pair, RIG, strict, replace(weak, since_detection=pairs - 2))
+    assert followed.since_detection == pairs - 1
+    searched = track_pair(scene("dark").pair, RIG, strict, followed)
+    assert searched.since_detection == 0
+
+
+def test_a_track_that_holds_is_not_searched_for() -> None:
+    since_long = replace(tracked("dark"), since_detection=1000)
+    assert track_pair(scene("dark").pair, RIG, None, since_long).since_detection == 1001
+
+
 # The same input, the same output
 
 

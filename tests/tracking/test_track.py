@@ -403,9 +403,10 @@ def test_behind_a_rod_the_needle_goes_on_less_surely() -> None:
 
 
 @pytest.mark.parametrize("y_mm", [-15.0, 5.0, 20.0])
-@pytest.mark.parametrize("diameter_mm", [3.0, 5.0])
-def test_a_dark_rod_is_not_taken_for_the_sleeve(y_mm: float, diameter_mm: float) -> None:
-    lighting = replace(DARK_ON_LIGHT, sleeve=Material(60.0), rod=Material(20.0, 60.0, 0.4))
+@pytest.mark.parametrize(("diameter_mm", "highlight"), [(3.0, 60.0), (5.0, 60.0), (5.0, 0.0), (6.5, 0.0)])
+def test_a_dark_rod_is_not_taken_for_the_sleeve(y_mm: float, diameter_mm: float, highlight: float) -> None:
+    # A plain black rod as wide as a sleeve differs from it in one thing only: the needle goes on behind it.
+    lighting = replace(DARK_ON_LIGHT, sleeve=Material(60.0), rod=Material(20.0, highlight, 0.4))
     rod = Rod((-50.0, y_mm, 215.0), (80.0, y_mm - 4.0, 215.0), diameter_mm)
     found, result = answer(World(RIG, ARC, lighting=lighting, rods=(rod,)))
     assert not result.false_ok

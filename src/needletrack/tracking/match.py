@@ -37,6 +37,8 @@ class MatchParameters(BaseModel):
 # Along the needle, a step in space is at most so many times the step that the left view shows: turned 70 degrees away.
 _MAX_FORESHORTENING = 3.0
 _COARSE_STRIDE = 4
+# Scenes with vessels have up to 100 pairs; a pattern of stripes has thousands, and none of them is a needle.
+_MAX_PAIRS = 150
 # Pairs are compared at every depth from half the nearest to four times the furthest of the workspace: a vessel behind
 # it then finds its true partner and is not offered to the needle.
 _DEPTH_MARGIN = (0.5, 4.0)
@@ -182,7 +184,7 @@ def _is_taken(stretch: tuple[float, float], taken: list[tuple[float, float]]) ->
 
 
 def _promising(left: list[Float], right: list[Float], rig: StereoRig, box: Workspace) -> list[tuple[int, int]]:
-    """Pairs of lines of which at least three left points have a crossing in the box."""
+    """Pairs of lines of which at least three left points have a crossing in the box, the most crossings first."""
     left_owner = np.repeat(np.arange(len(left)), [len(p) for p in left])
     right_owner = np.repeat(np.arange(len(right)), [len(p) for p in right])
     found = _crossings(np.concatenate(left), np.concatenate(right), rig, box)
@@ -191,7 +193,8 @@ def _promising(left: list[Float], right: list[Float], rig: StereoRig, box: Works
     rows = np.unique(np.column_stack([found.left_at, right_owner[before]])[within], axis=0)
     votes = np.zeros((len(left), len(right)), np.int64)
     np.add.at(votes, (left_owner[rows[:, 0]], rows[:, 1]), 1)
-    return [(int(i), int(j)) for i, j in np.argwhere(votes >= 3)]
+    most = np.argsort(-votes, axis=None, kind="stable")[:_MAX_PAIRS]
+    return [(int(i), int(j)) for i, j in zip(*np.unravel_index(most, votes.shape), strict=True) if votes[i, j] >= 3]
 
 
 def _candidate(left: Centerline, right: Centerline, chain: _Chain) -> Candidate:

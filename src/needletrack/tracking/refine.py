@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
+from scipy.ndimage import uniform_filter1d
 
 from needletrack.errors import NeedleNotFound
 from needletrack.geometry.camera import Camera
@@ -31,6 +32,8 @@ from needletrack.tracking.needle import Needle, Positive, Workspace
 Images = tuple[Image, Image]
 
 MIN_DEPTH_MM = 20.0
+# How far behind a sleeve's edge the needle is looked for once more, for how long a stretch and how strong a line.
+GOES_ON_FROM_MM, GOES_ON_TO_MM, GOES_ON_MM, GOES_ON_SHARE = 3.0, 16.0, 4.0, 0.6
 # Lens blur and saturation show a needle wider than it is.
 WIDTH_ALLOWANCE = 1.4
 _SILHOUETTE_PERCENTILE = 65
@@ -118,6 +121,9 @@ def refine(
     if base == -1:
         extended, observed = extended[::-1], (observed[0].turned(), observed[1].turned())
         stretch = Stretch(len(extended) - stretch.stop, len(extended) - stretch.start, stretch.sleeve)
+    base_is_known = base is not None and not (
+        stretch.sleeve is not None and _goes_on(images, rig, extended, observed, stretch, followed.diameter_mm, models)
+    )
     arc = arc_length(extended)
     # What was followed coarsely is looked at closely where the tip is.
     spacing = models.refine.spacing_mm
@@ -139,7 +145,32 @@ def refine(
     fit = fit_curve(visible, observed, rig, models.fit, ((left_end,), (right_end,)))
     tip_px = np.stack([_tip_px(view, end) for view, end in zip(observed, (left_end, right_end), strict=True)])
     seen_diameter_mm = _diameter_mm(observed, rig, visible)
-    return Refined(fit, observed, seen_diameter_mm or followed.diameter_mm, base is not None, tip, tip_px)
+    return Refined(fit, observed, seen_diameter_mm or followed.diameter_mm, base_is_known, tip, tip_px)
+
+
+def _goes_on(
+    images: Images,
+    rig: StereoRig,
+    extended_mm: Float,
+    observed: Observed,
+    stretch: Stretch,
+    diameter_mm: float,
+    models: RefineModels,
+) -> bool:
+    """Whether both views show the needle again behind what was taken for the sleeve: a dark rod may hide 6 mm of it.
+
+    The base is at the start of the stretch. A sleeve is longer than what is looked at, and its highlights are fainter.
+    """
+    spacing = models.refine.follow_spacing_mm
+    outwards = extended_mm[stretch.start : stretch.stop][::-1]
+    skipped, count = (round(mm / spacing) for mm in (GOES_ON_FROM_MM, GOES_ON_TO_MM))
+    behind = _observe(images, rig, _beyond(outwards, count, spacing)[skipped:], diameter_mm, models)
+    shares = [
+        view.signals_gray_px[1] / max(float(np.median(seen.signals_gray_px[1, stretch.start : stretch.stop])), 1e-6)
+        for view, seen in zip(behind, observed, strict=True)
+    ]
+    shown = np.min(shares, axis=0) > GOES_ON_SHARE
+    return bool(uniform_filter1d(shown.astype(np.float64), round(GOES_ON_MM / spacing), mode="constant").max() > 0.999)
 
 
 def _tip_observation(view: AxisObservations, ahead_mm: float, sigma_mm: float, spacing_mm: float) -> EndObservation:

@@ -7,12 +7,12 @@ from threading import Event
 
 import numpy as np
 import pytest
-from tests.scoring import Score, Summary, TrueShape, recorded_truth, score
 
 from needletrack.geometry.transform import orientation_along
 from needletrack.recording.asl import AslRecording
 from needletrack.recording.replay import ReplaySource
 from needletrack.records import BasePose, Float, NeedleCurve, NeedleTrack, Reason, Status, TipPose
+from needletrack.scoring import Score, Summary, TrueShape, recorded_truth, score
 from needletrack.tracking.track import track_pair
 
 RECORDINGS = Path(__file__).parent / "data" / "recordings"

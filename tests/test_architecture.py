@@ -26,6 +26,7 @@ FLOORS: dict[str, float] = {
     "pictures": 3.4,
     "recording": 3.5,
     "client": 3.5,
+    "scoring": 3.5,
     "service": 4.0,
     "watch": 4.1,
     "table1": 4.1,

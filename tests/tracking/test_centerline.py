@@ -9,11 +9,11 @@ import numpy.typing as npt
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from tests.scoring import off_polyline
 from tests.tracking.scenes import PX_PER_MM, RIG, SIZE_PX, WIDTHS_PX, WORLDS, scene, seen_at
 
 from needletrack.geometry.spline import arc_length
 from needletrack.records import Centerline, Float, Image
+from needletrack.scoring import off_polyline
 from needletrack.synthetic.world import Rod
 from needletrack.tracking.centerline import CenterlineParameters, trace_centerlines
 from needletrack.tracking.segment import SegmentParameters, find_ridges

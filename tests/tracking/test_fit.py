@@ -6,13 +6,13 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 from scipy.ndimage import gaussian_filter1d
-from tests.scoring import off_polyline
 from tests.tracking.scenes import RIG
 
 from needletrack.errors import NeedleNotFound
 from needletrack.geometry import spline
 from needletrack.geometry.camera import Camera
 from needletrack.records import Float, Reason
+from needletrack.scoring import off_polyline
 from needletrack.tracking.axis import AxisObservations
 from needletrack.tracking.fit import CurveFit, EndObservation, FitParameters, fit_curve, initial_curve
 

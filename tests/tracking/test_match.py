@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
-from tests.scoring import off_polyline
 from tests.tracking.scenes import ARC, MIDDLE_MM, PX_PER_MM, RIG
 
 from needletrack.errors import NeedleNotFound
@@ -14,6 +13,7 @@ from needletrack.geometry import spline
 from needletrack.geometry.camera import Camera
 from needletrack.geometry.epipolar import epipolar_distance_px, epipolar_lines
 from needletrack.records import Centerline, Float, Reason
+from needletrack.scoring import off_polyline
 from needletrack.synthetic.needle import NeedleMotion, Wave
 from needletrack.tracking.match import Candidate, MatchParameters, inside, match_lines
 from needletrack.tracking.needle import Needle, Range, Workspace

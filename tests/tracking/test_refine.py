@@ -4,12 +4,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from tests.scoring import off_polyline
 from tests.tracking.scenes import ARC, BEHIND, RIG, WORLDS, Scene, scene, seen_at
 
 from needletrack.errors import NeedleNotFound
 from needletrack.geometry import spline
 from needletrack.records import Float, Reason
+from needletrack.scoring import off_polyline
 from needletrack.synthetic.needle import NeedleMotion, Wave
 from needletrack.synthetic.world import World
 from needletrack.tracking.needle import Workspace

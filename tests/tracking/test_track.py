@@ -6,11 +6,11 @@ from functools import cache
 import numpy as np
 import numpy.typing as npt
 import pytest
-from tests.scoring import Score, Summary, TrueShape, off_polyline, score
 from tests.tracking.scenes import ARC, BEHIND, MIDDLE_MM, RIG, SIZE_PX, WORLDS, Scene, scene, seen_at, tracked
 
 from needletrack.geometry import spline
 from needletrack.records import Clock, Frame, Image, NeedleTrack, Reason, Status, StereoPair
+from needletrack.scoring import Score, Summary, TrueShape, off_polyline, score
 from needletrack.synthetic.background import Background
 from needletrack.synthetic.needle import NeedleMotion, Wave
 from needletrack.synthetic.render import Material

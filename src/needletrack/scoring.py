@@ -8,11 +8,12 @@ import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 import numpy.typing as npt
 
+from needletrack.errors import RecordingError
 from needletrack.geometry.spline import arc_length, resample
 from needletrack.records import Float, NeedleTrack, Status
 from needletrack.synthetic.world import Truth
@@ -33,6 +34,7 @@ class TrueShape:
 
     @classmethod
     def none(cls) -> Self:
+        """No needle is there."""
         return cls(np.zeros((0, 3)), np.zeros(3), np.zeros(0, np.bool_))
 
     @classmethod
@@ -44,19 +46,26 @@ class TrueShape:
 
 
 def recorded_truth(folder: Path) -> dict[int, TrueShape]:
-    """The truth of a recording by the left camera's stamp, ns."""
-    shapes = {}
-    for frame in json.loads((folder / "truth.json").read_text(encoding="utf-8"))["frames"]:
-        shapes[int(frame["t_ns"])] = (
-            TrueShape(
-                np.array(frame["centerline_mm"]),
-                np.array(frame["tip_direction"]),
-                np.asarray(np.array(frame["visible"], np.bool_).all(axis=0)),
-            )
-            if "centerline_mm" in frame
-            else TrueShape.none()
-        )
-    return shapes
+    """The truth of a recording by the left camera's stamp, ns; raises RecordingError where there is none to read."""
+    path = folder / "truth.json"
+    try:
+        return {
+            int(frame["t_ns"]): _true_shape(frame) for frame in json.loads(path.read_text(encoding="utf-8"))["frames"]
+        }
+    except OSError as error:
+        raise RecordingError(f"{path}: cannot read the truth: {error.strerror or error}") from error
+    except (ValueError, KeyError, TypeError) as error:
+        raise RecordingError(f"{path}: not the truth about a recording: {error!r}") from error
+
+
+def _true_shape(frame: dict[str, Any]) -> TrueShape:
+    if "centerline_mm" not in frame:
+        return TrueShape.none()
+    return TrueShape(
+        np.array(frame["centerline_mm"], dtype=np.float64),
+        np.array(frame["tip_direction"], dtype=np.float64),
+        np.asarray(np.array(frame["visible"], np.bool_).all(axis=0)),
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,6 +127,7 @@ class Summary:
 
     @classmethod
     def of(cls, scores: Sequence[Score]) -> Self:
+        """Summed up over the tracks of one or several recordings."""
         ok = [one for one in scores if one.status is Status.OK]
         points = [one.off_in_sigmas for one in ok if one.off_in_sigmas is not None]
         return cls(

@@ -13,6 +13,7 @@ from needletrack.records import (
     Centerline,
     Clock,
     Correspondences,
+    Evidence,
     Float,
     Frame,
     NeedleCurve,
@@ -147,6 +148,7 @@ def points(count: int, columns: int = 2) -> Float:
         (lambda: tip(velocity_mm_s=np.zeros(2)), "velocity_mm_s"),
         (lambda: BasePose(np.zeros(2), np.zeros(3)), "position_mm"),
         (lambda: BasePose(np.zeros(3), np.zeros(2)), "direction"),
+        (lambda: Evidence(axis_residual_px=points(4)), "axis_residual_px"),
     ],
 )
 def test_wrong_shapes_are_refused_by_name(build: Callable[[], object], complaint: str) -> None:
@@ -156,7 +158,12 @@ def test_wrong_shapes_are_refused_by_name(build: Callable[[], object], complaint
 
 @pytest.mark.parametrize(
     ("record", "field"),
-    [(frame(0), "image"), (curve(), "points_mm"), (tip(velocity_mm_s=np.ones(3)), "velocity_mm_s")],
+    [
+        (frame(0), "image"),
+        (curve(), "points_mm"),
+        (tip(velocity_mm_s=np.ones(3)), "velocity_mm_s"),
+        (Evidence(axis_residual_px=np.zeros((2, 5))), "axis_residual_px"),
+    ],
 )
 def test_neither_fields_nor_arrays_change(record: object, field: str) -> None:
     with pytest.raises(FrozenInstanceError):

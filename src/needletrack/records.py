@@ -266,11 +266,22 @@ class Quality:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Evidence:
-    """What the stages saw on the way, for pictures and reports; no part of the wire."""
+    """What the stages saw on the way, for pictures and reports; no part of the wire.
+
+    axis_residual_px (2, N): how far the axis seen in the left and in the right view lies beside the projected curve,
+    at each point of the track's curve; NaN where it was not seen. Positive to the right of the way from base to tip,
+    in an image whose rows run down; undistorted px.
+    """
 
     left: Centerline | None = None
     right: Centerline | None = None
     correspondences: Correspondences | None = None
+    axis_residual_px: Float | None = None
+
+    def __post_init__(self) -> None:
+        if self.axis_residual_px is not None:
+            residual = frozen_array(self.axis_residual_px, (2, None), "axis_residual_px")
+            object.__setattr__(self, "axis_residual_px", residual)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -1,6 +1,6 @@
 """A refined curve with its verdict, and the track that is published of it."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -102,7 +102,7 @@ def as_track(
         since_detection,
         shape.quality,
         elapsed_ms,
-        evidence,
+        replace(evidence, axis_residual_px=fit.residual_px),
     )
 
 

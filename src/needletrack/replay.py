@@ -45,8 +45,8 @@ class Replay:
     ) -> None:
         rig = recording.rig
         rig.require_view_of(config.tracking.workspace)
-        self._publishing = config.publishing
-        self._recording, self._start, self._paced = recording, start, paced
+        self.recording, self.config, self.method, self.independent = recording, config, method, independent
+        self._start, self._paced = start, paced
         self._tracker = _tracker(method, rig, config)
         self.source = ReplaySource(recording, paced=paced, start=start, end=end, loop=loop)
         self.context = RunContext(rig.name, Source.REPLAY, config.digest, rig.digest, deterministic=not paced)
@@ -63,7 +63,7 @@ class Replay:
     def warm_up(self) -> None:
         """Track the first pair once, for nothing: the first call of every library takes a multiple of the next."""
         with suppress(UnusablePair):  # it will be counted when its turn comes
-            self._tracker(self._recording.read(self._start), None)
+            self._tracker(self.recording.read(self._start), None)
 
     def publisher(self, endpoint: str) -> ZenohPublisher:
         """Where this run's messages are published: listens on `endpoint`, the rest as configured."""
@@ -71,9 +71,9 @@ class Replay:
             self.context,
             self.service.status,
             listen=[endpoint],
-            connect=self._publishing.connect,
-            key_prefix=self._publishing.key_prefix,
-            heartbeat_s=self._publishing.heartbeat_s,
+            connect=self.config.publishing.connect,
+            key_prefix=self.config.publishing.key_prefix,
+            heartbeat_s=self.config.publishing.heartbeat_s,
         )
 
     def run(

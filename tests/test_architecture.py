@@ -35,6 +35,7 @@ FLOORS: dict[str, float] = {
     "terminal": 5.2,
     "replay": 5.2,
     "demo": 5.3,
+    "report": 5.3,
     "cli": 5.4,
     "__main__": 5.5,
 }

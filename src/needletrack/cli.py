@@ -48,6 +48,20 @@ Recording = Annotated[
     Path, typer.Argument(metavar="RECORDING", help="Folder in the EuRoC/ASL layout (docs/recordings.md).")
 ]
 ConfigFile = Annotated[Path | None, typer.Option("--config", help="TOML file (docs/configuration.md).")]
+RigFile = Annotated[
+    Path | None,
+    typer.Option(
+        "--rig",
+        help="Rig file or Kalibr camchain. Without it: rig.path of the configuration; without that: "
+        "the recording's own rig.yaml or camchain.yaml.",
+    ),
+]
+Independent = Annotated[
+    bool, typer.Option("--independent", help="Start every pair without memory: for recordings of stills.")
+]
+Start = Annotated[int, typer.Option(min=0, help="First pair, from 0.")]
+End = Annotated[int | None, typer.Option(min=0, help="The pair after the last; all without it.")]
+Method = Annotated[Literal["curve", "reference"], typer.Option(help="Ours, or that of 2017.")]
 RigPath = Annotated[Path, typer.Argument(metavar="PATH", help="Rig file, Kalibr camchain, or a folder with either.")]
 
 
@@ -95,13 +109,7 @@ def demo(
 @plain_errors
 def replay(
     recording: Recording,
-    rig: Annotated[
-        Path | None,
-        typer.Option(
-            help="Rig file or Kalibr camchain. Without it: rig.path of the configuration; without that: "
-            "the recording's own rig.yaml or camchain.yaml."
-        ),
-    ] = None,
+    rig: RigFile = None,
     config: ConfigFile = None,
     paced: Annotated[
         bool,
@@ -111,13 +119,11 @@ def replay(
             "as fast as it goes: the same output bytes every time.",
         ),
     ] = False,
-    independent: Annotated[
-        bool, typer.Option("--independent", help="Start every pair without memory: for recordings of stills.")
-    ] = False,
-    start: Annotated[int, typer.Option(min=0, help="First pair, from 0.")] = 0,
-    end: Annotated[int | None, typer.Option(min=0, help="The pair after the last; all without it.")] = None,
+    independent: Independent = False,
+    start: Start = 0,
+    end: End = None,
     loop: Annotated[int, typer.Option(min=1, help="Play so many times, forward and backward in turn.")] = 1,
-    method: Annotated[Literal["curve", "reference"], typer.Option(help="Ours, or that of 2017.")] = "curve",
+    method: Method = "curve",
     output: Annotated[
         Path | None, typer.Option(help="Write the tracks: .jsonl (all) or .csv (no centerlines).")
     ] = None,
@@ -151,6 +157,45 @@ def replay(
             summary = played.run(interruption.stop, output=output, publish=publish, sinks=[progress])
     typer.echo(described(summary), err=True)
     raise typer.Exit(interruption.exit_code or (0 if summary.pairs else 1))
+
+
+@app.command()
+@plain_errors
+def report(
+    recording: Recording,
+    output: Annotated[Path, typer.Option(help="The HTML file to write.")] = Path("report.html"),
+    rig: RigFile = None,
+    config: ConfigFile = None,
+    independent: Independent = False,
+    start: Start = 0,
+    end: End = None,
+    method: Method = "curve",
+    most: Annotated[
+        int, typer.Option(min=0, help="Show so many pairs in full, the worst; the figures are of all.")
+    ] = 40,
+    truth: Annotated[
+        bool, typer.Option("--truth/--no-truth", help="Compare with the recording's truth.json, where it has one.")
+    ] = True,
+) -> None:
+    """Track a recording, and write one HTML page to look at: figures over the pairs, and the worst pairs in full.
+
+    The page holds all that it shows, about 250 kB for a pair shown in full. Exit codes as of replay.
+    """
+    from needletrack.config import load_config
+    from needletrack.replay import Replay, open_recording
+    from needletrack.report import write_report
+    from needletrack.terminal import Interruption, ProgressBar, described, warnings_shown
+
+    effective, console = load_config(config), Console(stderr=True)
+    with Interruption() as interruption, warnings_shown(console):
+        opened = open_recording(recording, effective, rig)
+        played = Replay(opened, effective, method=method, independent=independent, start=start, end=end)
+        with ProgressBar(console, start, len(played.source)) as progress:
+            written = write_report(played, output, interruption.stop, most=most, with_truth=truth, sinks=[progress])
+    typer.echo(described(written.run), err=True)
+    size_mb = written.size_bytes / 1e6
+    typer.echo(f"written: {written.path}, {size_mb:.1f} MB, {written.shown} of {written.run.pairs} pairs in full")
+    raise typer.Exit(interruption.exit_code or (0 if written.run.pairs else 1))
 
 
 @app.command()

@@ -15,7 +15,7 @@ from needletrack.geometry.spline import arc_length, unit
 from needletrack.geometry.stereo import StereoRig
 from needletrack.records import Float, NeedleCurve, NeedleTrack, StereoPair
 from needletrack.report.svg import Element, Panel, digits, drawing, element, markup, tick_text, ticks
-from needletrack.report.views import View, data_uri, stretched
+from needletrack.report.views import View, data_uri, stretched, stretches
 from needletrack.scoring import TrueShape, off_polyline
 
 WIDTH_PX = 1180
@@ -173,44 +173,37 @@ def _draw_strip(
     for value in (-step, 0.0, step):
         at = y + float(panel.place(0.0, value)[0, 1])
         element(svg, "text", tick_text(value), x=_LEFT_PX - 6, y=at + 4, class_="tick end")
-    truth = Panel(element(svg, "g", class_="truth"), panel.x, y, width, _STRIP_PX, x_range, (half_px, -half_px))
-    truth.line(strip.at_mm, strip.truth_px, "true-casing")
-    truth.line(strip.at_mm, strip.truth_px, "true-axis")
-    if strip.true_tip_mm is not None:
-        at = panel.x + float(panel.place(strip.true_tip_mm, 0.0)[0, 0])
-        element(truth.svg, "line", x1=at, x2=at, y1=y, y2=y + _STRIP_PX, class_="true-end")
-    drawn = element(svg, "g", class_="drawn")
-    inner = element(drawn, "svg", **place)
-    shown = Panel(inner, 0, 0, width, _STRIP_PX, x_range, (half_px, -half_px))
-    shown.line([0.0, seen[0][-1]], [0.0, 0.0], "axis")
+    if np.isfinite(strip.truth_px).any():
+        truth = panel.layer("truth")
+        truth.line(strip.at_mm, strip.truth_px, "true-casing")
+        truth.line(strip.at_mm, strip.truth_px, "true-axis")
+        if strip.true_tip_mm is not None:
+            at = panel.x + float(panel.place(strip.true_tip_mm, 0.0)[0, 0])
+            element(truth.svg, "line", x1=at, x2=at, y1=y, y2=y + _STRIP_PX, class_="true-end")
+    drawn = panel.layer("drawn")
+    drawn.line([0.0, seen[0][-1]], [0.0, 0.0], "axis")
     if seen[1] is not None:
-        shown.dots(seen[0], seen[1], "observed")
+        drawn.dots(seen[0], seen[1], "observed")
 
 
 def _draw_seen(svg: Element, curve: NeedleCurve, along_mm: Float, y: float, x_range: tuple[float, float]) -> None:
     width = WIDTH_PX - _LEFT_PX - _RIGHT_PX
     bar = Panel(svg, _LEFT_PX, y, width, _BAR_PX, x_range, (0.0, 1.0))
     element(svg, "rect", x=_LEFT_PX, y=y, width=width, height=_BAR_PX, class_="panel")
-    half = float(along_mm[1]) / 2
-    for cameras in (2, 1, 0):
-        at = along_mm[curve.seen == cameras]
-        left = _LEFT_PX + bar.place(at - half, 0)[:, 0]
-        right = _LEFT_PX + bar.place(at + half, 0)[:, 0]
-        path = "".join(
-            f"M{digits(a, 1)} {digits(y)}H{digits(b, 1)}v{_BAR_PX}H{digits(a, 1)}z"
-            for a, b in zip(left, right, strict=True)
-        )
-        element(svg, "path", d=path, class_=f"bar seen-{cameras}")
+    middles = (along_mm[:-1] + along_mm[1:]) / 2
+    edges = _LEFT_PX + bar.place(np.concatenate([[0.0], middles, along_mm[-1:]]), 0)[:, 0]
+    for cameras, first, last in stretches(curve.seen.tolist()):
+        left, right = float(edges[first]), float(edges[last])
+        element(svg, "rect", x=left, y=y, width=right - left, height=_BAR_PX, class_=f"cameras seen-{cameras}")
     bar.label("seen by")
 
 
 def _draw_offsets(panel: Panel, along_mm: Float, residual_px: Float | None, strips: list[_Strip]) -> None:
     """What each view showed beside the projected curve, and where the true axis lies."""
-    every = np.concatenate(
-        [strip.truth_px for strip in strips] + ([] if residual_px is None else [residual_px.ravel()])
-    )
-    most = float(np.nanpercentile(np.abs(every), 98)) if np.isfinite(every).any() else 1.0
-    most = max(0.5, 1.25 * most)
+    seen_px = 0.0 if residual_px is None else _most(residual_px)
+    true_px = _most(np.concatenate([strip.truth_px for strip in strips]))
+    # A true axis that is far off runs out of the chart; otherwise what was seen would become one flat line.
+    most = 1.25 * max(0.4, seen_px, min(true_px, max(3.0, 6 * seen_px)))
     panel = replace(panel, y_range=(-most, most))
     panel.frame("axis beside\nthe curve", "px")
     panel.line(panel.x_range, (0.0, 0.0), "zero")
@@ -224,6 +217,12 @@ def _draw_offsets(panel: Panel, along_mm: Float, residual_px: Float | None, stri
             panel.layer("truth").line(strip.at_mm, strip.truth_px, f"{side} dashed")
             legend.append((f"true, {side}", f"{side} dashed"))
     panel.legend(legend)
+
+
+def _most(values: Float) -> float:
+    """The size of nearly all that are known; 0 where none is."""
+    known = np.abs(values[np.isfinite(values)])
+    return float(np.percentile(known, 98)) if len(known) else 0.0
 
 
 def _draw_sigmas(

@@ -157,7 +157,7 @@ def _pieces(
     limits = _Limits(gates.max_sigma_mm, gates.max_reprojection_rms_px, gates.min_coverage)
     trends = trends_figure(rows, [figures.sequence for figures, _ in chosen], gates) if rows else None
     yield from environment.get_template("page.html").generate(
-        title=f"{replay.recording.folder.resolve().name}: {len(rows)} pairs tracked",
+        title=f"{replay.recording.folder.resolve().name}: {len(rows)} {'pair' if len(rows) == 1 else 'pairs'} tracked",
         facts=_facts(replay, summary, rows),
         statuses=[(status, summary.statuses.get(status, 0)) for status in Status],
         reasons=[

@@ -137,6 +137,15 @@ def stretched(image: Image, like: Image | None = None) -> Image:
     return np.asarray(np.clip(spread, 0, 255), dtype=np.uint8)
 
 
+def stretches(values: list[int]) -> Iterator[tuple[int, int, int]]:
+    """(value, first, one past the last) of each run of equal values."""
+    first = 0
+    for index in range(1, len(values) + 1):
+        if index == len(values) or values[index] != values[first]:
+            yield values[first], first, index
+            first = index
+
+
 def _cut_outs(views: tuple[View, View], track: NeedleTrack, truth: TrueShape | None) -> tuple[Box, Box]:
     """The parts of both images with the needle in them, of one size and of the images' shape; else the whole images."""
     shown = [line for line in (_curve_mm(track), _true_mm(truth)) if line is not None]
@@ -261,17 +270,8 @@ def _draw_band(group: Element, view: View, curve: NeedleCurve, times: int) -> No
 def _draw_curve(group: Element, view: View, curve: NeedleCurve) -> None:
     points_px = view.project(curve.points_mm)
     element(group, "path", d=line_path(points_px), class_="casing")
-    for seen, first, last in _stretches(np.minimum(curve.seen[:-1], curve.seen[1:]).tolist()):
+    for seen, first, last in stretches(np.minimum(curve.seen[:-1], curve.seen[1:]).tolist()):
         element(group, "path", d=line_path(points_px[first : last + 1]), class_=f"curve seen-{seen}")
-
-
-def _stretches(values: list[int]) -> Iterator[tuple[int, int, int]]:
-    """(value, first, one past the last) of each run of equal values."""
-    first = 0
-    for index in range(1, len(values) + 1):
-        if index == len(values) or values[index] != values[first]:
-            yield values[first], first, index
-            first = index
 
 
 def _draw_truth(svg: Element, view: View, truth: TrueShape | None, mark_px: float) -> None:

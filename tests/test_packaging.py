@@ -61,6 +61,7 @@ def test_the_wheel_carries_the_typed_package_and_its_licence(tmp_path: Path) -> 
         scripts = archive.read(f"{info}/entry_points.txt").decode()
         licence = archive.read(f"{info}/licenses/LICENSE").decode()
     assert "needletrack/py.typed" in names
+    assert "needletrack/report/templates/page.html" in names
     assert {name.split("/")[0] for name in names} == {"needletrack", info}
     assert "needletrack = needletrack.cli:app" in scripts
     assert "Apache License" in licence

@@ -12,7 +12,7 @@ CODE = $(wildcard src tests tools benchmarks)
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help env demo test test-slow lint format types bench bench-smoke table1 schema lock clean
+.PHONY: help env demo test test-slow lint format types bench bench-smoke accuracy accuracy-page peers table1 schema lock clean
 
 help:  ## list the targets
 	@awk -F ':.*## ' '/^[a-z0-9-]+:.*## / { printf "  make %-12s %s\n", $$1, $$2 }' Makefile
@@ -63,6 +63,20 @@ bench: $(INSTALLED)  ## time per stage and pair, throughput, memory, ratio to th
 
 bench-smoke: $(INSTALLED)  ## the same on a few pairs: does the benchmark still run?
 	@$(BIN)/python -m benchmarks --smoke
+
+accuracy: $(INSTALLED)  ## errors against exact truth, beside other methods (make accuracy ARGS="--peers RECORDING ...")
+	@$(BIN)/python -m benchmarks.accuracy $(ARGS)
+
+accuracy-page: $(INSTALLED) peers  ## measure anew what docs/accuracy.md shows (a quarter of an hour)
+	@$(BIN)/python -m benchmarks.accuracy --peers --update docs/accuracy.md ../shared/captures/* tests/data/recordings/*
+
+# Other people's methods, for comparison only: in an environment of their own, and no dependency of the package.
+peers: build/peers/.installed  ## make the peers' environment build/peers from requirements/peers.txt (several GB)
+
+build/peers/.installed: requirements/peers.txt
+	@"$(PYTHON)" -m venv --clear build/peers
+	@build/peers/bin/python -m pip --disable-pip-version-check install --quiet -r requirements/peers.txt
+	@touch $@
 
 table1: $(INSTALLED)  ## repeat Table 1 of the 2017 paper
 	@$(BIN)/needletrack table1

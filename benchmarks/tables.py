@@ -22,16 +22,22 @@ def show(report: Report, console: Console) -> None:
         tables.append(_throughput(report.throughput))
     if report.memory is not None:
         tables.append(_memory(report.memory))
-    for title, table, notes in tables:
-        if console.is_terminal:
-            console.print(title, style="bold", highlight=False)
-            console.print(table)
-            console.print(f"{notes}\n", style="dim", highlight=False)
-        else:
-            print(f"### {title}\n\n{_markdown(table)}\n\n{notes}\n", file=console.file)
+    for titled in tables:
+        print_titled(*titled, console)
 
 
-def _markdown(table: Table) -> str:
+def print_titled(title: str, table: Table, notes: str, console: Console) -> None:
+    """Print one table with its title and notes; into a pipe or a file as Markdown."""
+    if console.is_terminal:
+        console.print(title, style="bold", highlight=False)
+        console.print(table)
+        console.print(f"{notes}\n", style="dim", highlight=False)
+    else:
+        print(f"### {title}\n\n{markdown(table)}\n\n{notes}\n", file=console.file)
+
+
+def markdown(table: Table) -> str:
+    """A table in Markdown, a line a row."""
     table.box = box.MARKDOWN
     for row in table.rows:
         row.end_section = False
@@ -41,7 +47,8 @@ def _markdown(table: Table) -> str:
     return "\n".join(line.rstrip() for line in written.get().strip().splitlines())
 
 
-def _table(*headings: str) -> Table:
+def headed(*headings: str) -> Table:
+    """An empty table of figures, the first column of which is text."""
     table = Table(box=box.SIMPLE_HEAD)
     table.add_column(headings[0])
     for heading in headings[1:]:
@@ -69,7 +76,7 @@ def _scene(times: SceneTimes) -> Titled:
     statuses = ", ".join(f"{count} {status}" for status, count in times.statuses.items())
     memory = "each pair without memory" if times.independent else "with memory"
     width, height = times.size_px
-    table = _table("method and stage", "pairs", "median ms", "p99 ms", "least ms")
+    table = headed("method and stage", "pairs", "median ms", "p99 ms", "least ms")
     for name, method in times.methods.items():
         for row in _method_rows(name, method):
             table.add_row(*row)
@@ -100,7 +107,7 @@ def _method_rows(name: str, method: MethodTimes) -> Iterator[tuple[str, ...]]:
 
 
 def _throughput(found: Throughput) -> Titled:
-    table = _table("publishing", "pairs/s, median of runs", "each run")
+    table = headed("publishing", "pairs/s, median of runs", "each run")
     for name, rates in (("off", found.publishing_off), ("on", found.publishing_on)):
         table.add_row(name, f"{median(rates):.1f}", "  ".join(f"{rate:.1f}" for rate in rates))
     notes = (
@@ -111,7 +118,7 @@ def _throughput(found: Throughput) -> Titled:
 
 
 def _memory(found: Memory) -> Titled:
-    table = _table("resident memory", "MB")
+    table = headed("resident memory", "MB")
     table.add_row("before the first pair", f"{found.started_mb:.1f}")
     table.add_row("settled", f"{found.settled_mb:.1f}")
     table.add_row("end", f"{found.end_mb:.1f}")

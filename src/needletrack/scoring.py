@@ -6,7 +6,7 @@ millimetre; less than 0.8 of what both cameras see covered; base and tip exchang
 
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Self
 
@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from needletrack.errors import RecordingError
-from needletrack.geometry.spline import arc_length, resample
+from needletrack.geometry.spline import arc_length, distance_from_curve, resample
 from needletrack.records import Float, NeedleTrack, Status
 from needletrack.synthetic.world import Truth
 
@@ -26,11 +26,20 @@ STEP_MM, MOST_POINTS = 0.5, 4000
 
 @dataclass(frozen=True, eq=False)
 class TrueShape:
-    """What is so: centerline_mm (N, 3) base -> tip, tip_direction (3,), seen (N,) by both cameras; N = 0: no needle."""
+    """What is so: centerline_mm (N, 3) base -> tip, tip_direction (3,), seen (N,) by both cameras; N = 0: no needle.
+
+    stated_tip_mm (3,): the tip where the truth states it apart from the centerline, whose end is rounded otherwise.
+    """
 
     centerline_mm: Float
     tip_direction: Float
     seen: npt.NDArray[np.bool_]
+    stated_tip_mm: Float | None = None
+
+    @property
+    def tip_mm(self) -> Float:
+        """The tip (3,) of a needle that is there."""
+        return self.centerline_mm[-1] if self.stated_tip_mm is None else self.stated_tip_mm
 
     @classmethod
     def none(cls) -> Self:
@@ -65,6 +74,7 @@ def _true_shape(frame: dict[str, Any]) -> TrueShape:
         np.array(frame["centerline_mm"], dtype=np.float64),
         np.array(frame["tip_direction"], dtype=np.float64),
         np.asarray(np.array(frame["visible"], np.bool_).all(axis=0)),
+        np.array(frame["tip_mm"], dtype=np.float64),
     )
 
 
@@ -72,13 +82,15 @@ def _true_shape(frame: dict[str, Any]) -> TrueShape:
 class Score:
     """One track against the truth; None where track or truth have nothing to compare.
 
+    misleads: whether a robot that acts on the shape, whatever its status, would go wrong (see above).
     rms_mm, worst_mm (95th percentile): of the reported curve about the true one. tip_mm, direction_deg: only where both
     cameras see the tip. cover: share of what both cameras see that has a reported curve within a millimetre.
-    off_in_sigmas (M,): distance of each reported point from the true curve over its stated sigma.
+    off_in_sigmas (M,): distance of each reported point from the true curve over its stated sigma. sigma_mm: the median
+    of the stated sigmas.
     """
 
     status: Status
-    false_ok: bool
+    misleads: bool
     rms_mm: float | None = None
     worst_mm: float | None = None
     tip_mm: float | None = None
@@ -86,66 +98,90 @@ class Score:
     cover: float | None = None
     turned: bool | None = None
     off_in_sigmas: Float | None = None
+    sigma_mm: float | None = None
+
+    @property
+    def false_ok(self) -> bool:
+        """Whether the track is called ok and misleads."""
+        return self.status is Status.OK and self.misleads
+
+    def believed(self) -> "Score":
+        """The score that the track would have if it were called ok; without a shape nothing can be believed."""
+        return self if self.status is Status.INVALID else replace(self, status=Status.OK)
 
 
 def score(track: NeedleTrack, truth: TrueShape) -> Score:
     """The score of one track."""
-    is_ok = track.status is Status.OK
     if track.curve is None or len(truth.centerline_mm) == 0:
-        return Score(track.status, false_ok=is_ok)
+        return Score(track.status, misleads=track.curve is not None)
     line, points = truth.centerline_mm, track.curve.points_mm
     even = resample(points, int(np.clip(arc_length(points)[-1] / STEP_MM, 2, MOST_POINTS)))
-    off_mm = off_polyline(even, line)
+    off_mm = distance_from_curve(even, line)
     worst_mm = float(np.percentile(off_mm, 95))
-    cover = float((off_polyline(line[truth.seen], even) < GREATEST_ERROR_MM).mean()) if truth.seen.any() else 0.0
+    cover = float((distance_from_curve(line[truth.seen], even) < GREATEST_ERROR_MM).mean()) if truth.seen.any() else 0.0
     turned = bool(np.linalg.norm(points[-1] - line[0]) < np.linalg.norm(points[0] - line[0]))
-    tip_mm = np.inf if track.tip is None else float(np.linalg.norm(track.tip.position_mm - line[-1]))
+    tip_mm = np.inf if track.tip is None else float(np.linalg.norm(track.tip.position_mm - truth.tip_mm))
     sees_tip = track.tip is not None and bool(truth.seen[-1])
     return Score(
         track.status,
-        is_ok and (tip_mm > GREATEST_ERROR_MM or worst_mm > GREATEST_ERROR_MM or cover < LEAST_COVER or turned),
+        tip_mm > GREATEST_ERROR_MM or worst_mm > GREATEST_ERROR_MM or cover < LEAST_COVER or turned,
         float(np.sqrt((off_mm**2).mean())),
         worst_mm,
         tip_mm if sees_tip else None,
         angle_deg(track.tip.direction, truth.tip_direction) if track.tip is not None and sees_tip else None,
         cover,
         turned,
-        off_polyline(points, line) / track.curve.sigma_mm,
+        distance_from_curve(points, line) / track.curve.sigma_mm,
+        float(np.median(track.curve.sigma_mm)),
     )
 
 
 @dataclass(frozen=True)
 class Summary:
-    """Medians over the ok tracks, the share of all their points within twice their sigma, and how many were false."""
+    """How many tracks carry each status, how many ok ones were false, and how far off the ok ones are.
 
+    Medians over the ok tracks, and 95th percentiles where the name says p95; within_two_sigma: share of all their
+    points within twice their sigma. degraded_*: medians over the degraded tracks. NaN: there is nothing to sum up.
+    """
+
+    frames: int
     ok: int
+    degraded: int
+    invalid: int
     false_ok: int
-    rms_mm: float
     tip_mm: float
+    tip_p95_mm: float
+    direction_deg: float
+    rms_mm: float
+    worst_p95_mm: float
     cover: float
     within_two_sigma: float
+    sigma_mm: float
+    degraded_rms_mm: float
+    degraded_cover: float
 
     @classmethod
     def of(cls, scores: Sequence[Score]) -> Self:
         """Summed up over the tracks of one or several recordings."""
-        ok = [one for one in scores if one.status is Status.OK]
+        ok, degraded, invalid = ([one for one in scores if one.status is status] for status in Status)
         points = [one.off_in_sigmas for one in ok if one.off_in_sigmas is not None]
         return cls(
-            len(ok),
-            sum(one.false_ok for one in scores),
-            _median([one.rms_mm for one in ok]),
-            _median([one.tip_mm for one in ok]),
-            _median([one.cover for one in ok]),
-            float((np.concatenate(points) <= 2).mean()) if points else np.nan,
+            frames=len(scores),
+            ok=len(ok),
+            degraded=len(degraded),
+            invalid=len(invalid),
+            false_ok=sum(one.false_ok for one in scores),
+            tip_mm=_percentile([one.tip_mm for one in ok], 50),
+            tip_p95_mm=_percentile([one.tip_mm for one in ok], 95),
+            direction_deg=_percentile([one.direction_deg for one in ok], 50),
+            rms_mm=_percentile([one.rms_mm for one in ok], 50),
+            worst_p95_mm=_percentile([one.worst_mm for one in ok], 95),
+            cover=_percentile([one.cover for one in ok], 50),
+            within_two_sigma=float((np.concatenate(points) <= 2).mean()) if points else np.nan,
+            sigma_mm=_percentile([one.sigma_mm for one in ok], 50),
+            degraded_rms_mm=_percentile([one.rms_mm for one in degraded], 50),
+            degraded_cover=_percentile([one.cover for one in degraded], 50),
         )
-
-
-def off_polyline(points: Float, line: Float) -> Float:
-    """Distance (N,) of each point (N, D) from a polyline (M, D)."""
-    start, step = line[:-1], np.diff(line, axis=0)
-    along = ((points[:, None] - start) * step).sum(-1) / np.maximum((step**2).sum(-1), 1e-12)
-    nearest = start + np.clip(along, 0, 1)[..., None] * step
-    return np.asarray(np.linalg.norm(points[:, None] - nearest, axis=-1).min(axis=1))
 
 
 def angle_deg(one: Float, other: Float) -> float:
@@ -154,6 +190,6 @@ def angle_deg(one: Float, other: Float) -> float:
     return float(np.degrees(np.arccos(np.clip(cosine, -1, 1))))
 
 
-def _median(values: Sequence[float | None]) -> float:
+def _percentile(values: Sequence[float | None], percent: float) -> float:
     known = [value for value in values if value is not None]
-    return float(np.median(known)) if known else np.nan
+    return float(np.percentile(known, percent)) if known else np.nan

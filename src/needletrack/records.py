@@ -213,6 +213,18 @@ class NeedleCurve:
         object.__setattr__(self, "curvature_per_mm", frozen_array(self.curvature_per_mm, (n,), "curvature_per_mm"))
 
 
+@dataclass(frozen=True, slots=True)
+class Appearance:
+    """What is the same all along a needle and in both views, as `tracking/evidence.py` numbers it.
+
+    half_width, blur, inside: indices of its half width, of the blur of the lens, of how lively its inside is.
+    """
+
+    half_width: int
+    blur: int
+    inside: int
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class TipPose:
     """The free end: position_mm (3,), unit direction (3,) out of the tip, orientation_xyzw (4,).
@@ -288,7 +300,8 @@ class Evidence:
 class NeedleTrack:
     """The answer for one stereo pair, also when it is `invalid` (then curve, tip and base are None).
 
-    since_detection counts the pairs that were tracked from the one before since the whole images were last searched.
+    since_detection counts the pairs that were tracked from the one before since the whole images were last searched;
+    doubts are those of the reasons that only such a search can find, or lift.
 
     Raises ValueError where status and content contradict each other: an `ok` track has a curve and
     a tip and no reasons; a `degraded` one has a curve and reasons; an `invalid` one has no shape.
@@ -301,10 +314,12 @@ class NeedleTrack:
     tip: TipPose | None = None
     base: BasePose | None = None
     diameter_mm: float | None = None
+    appearance: Appearance | None = None
     since_detection: int = 0
     quality: Quality = Quality()
     timing_ms: Mapping[str, float] = field(default_factory=dict)
     evidence: Evidence = Evidence()
+    doubts: tuple[Reason, ...] = ()
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "timing_ms", MappingProxyType(dict(self.timing_ms)))

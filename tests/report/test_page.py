@@ -232,7 +232,7 @@ def test_the_truth_is_shown_where_there_is_one(report: Reported) -> None:
 def test_without_the_truth_nothing_is_said_of_it(tmp_path: Path) -> None:
     told = run(RECORDINGS / "steel-a", "--independent", "--no-truth", "--output", tmp_path / "report.html")
     assert told.exit_code == 0, told.stderr
-    assert re.fullmatch(r"written: \S+report.html, \d\.\d MB, 1 of 1 pairs in full\n", told.stdout)
+    assert re.fullmatch(r"written: \S+report.html, \d\.\d MB, 2 of 2 pairs in full\n", told.stdout)
     page = parsed((tmp_path / "report.html").read_text(encoding="utf-8"))
     assert not [node for node in page.walk() if "truth" in node.classes]
     assert "falsely ok" not in page.one("div", "tiles").text

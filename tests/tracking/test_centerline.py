@@ -11,9 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from tests.tracking.scenes import PX_PER_MM, RIG, SIZE_PX, WIDTHS_PX, WORLDS, scene, seen_at
 
-from needletrack.geometry.spline import arc_length
+from needletrack.geometry.spline import arc_length, distance_from_curve
 from needletrack.records import Centerline, Float, Image
-from needletrack.scoring import off_polyline
 from needletrack.synthetic.world import Rod
 from needletrack.tracking.centerline import CenterlineParameters, trace_centerlines
 from needletrack.tracking.segment import SegmentParameters, find_ridges
@@ -59,7 +58,7 @@ def follows(line: Centerline, start: Float, end: Float) -> bool:
     backward = np.linalg.norm(ends - [end, start], axis=1).max()
     # A skeleton ends half a width before the line, the mask half a width after it; and it turns to a square corner.
     from_ends = np.linalg.norm(line.points_px[:, None] - [start, end], axis=2).min(axis=1)
-    off = off_polyline(line.points_px[from_ends > 4 * LINE_PX], np.array([start, end]))
+    off = distance_from_curve(line.points_px[from_ends > 4 * LINE_PX], np.array([start, end]))
     return min(forward, backward) < 2 * LINE_PX + REDUCED_PX and float(off.max()) < REDUCED_PX
 
 
@@ -69,10 +68,10 @@ def test_a_drawn_needle_is_the_longest_line(name: str) -> None:
     for image, truth_px in zip(scene(name).images, RIG.project(truth_mm), strict=True):
         line = lines_in(image)[0]
         # The skeleton is a staircase of reduced pixels, smoothed.
-        assert np.sqrt(np.mean(off_polyline(line.points_px, truth_px) ** 2)) < REDUCED_PX / 2
-        # It misses the cone's thin end and some of what lies before the sleeve, each 2.5 mm.
-        missed = off_polyline(truth_px, line.points_px) > REDUCED_PX
-        assert 0.5 * missed.sum() < 5.0
+        assert np.sqrt(np.mean(distance_from_curve(line.points_px, truth_px) ** 2)) < REDUCED_PX / 2
+        # It misses the cone's thin end and some of what lies before the sleeve, each 3 mm.
+        missed = distance_from_curve(truth_px, line.points_px) > REDUCED_PX
+        assert 0.5 * missed.sum() < 6.0
         # It runs on: no step is longer than the smallest gap that is bridged.
         assert np.linalg.norm(np.diff(line.points_px, axis=0), axis=1).max() < 2 * REDUCED_PX
 
@@ -127,15 +126,36 @@ def test_a_line_is_not_continued_round_a_corner() -> None:
         assert sum(follows(line, start, end) for line in found) == 1
 
 
+def test_a_line_ends_at_a_corner() -> None:
+    # As a needle's skeleton does where it goes over to the edge of its sleeve.
+    corner = np.array([200.0, 150.0])
+    down = corner, np.array([200.0, 550.0])
+    right = corner, np.array([600.0, 150.0])
+    found = lines_in(exposed(with_line(with_line(plain(), *down), *right)))
+    assert len(found) == 2
+    for line in found:
+        assert min(distance_from_curve(line.points_px, np.array(arm)).max() for arm in (down, right)) < REDUCED_PX
+        assert arc_length(line.points_px)[-1] > 0.9 * 400.0
+
+
+def test_a_faint_needle_beside_a_wide_dark_vessel_is_a_line() -> None:
+    # The vessel is told from the needle's side lobes: its response does not swallow the needle's.
+    start, end = np.array([360.0, 100.0]), np.array([380.0, 500.0])
+    vessel = np.array([44.0, 0.0])
+    drawn = with_line(plain(), start + vessel, end + vessel, 20.0, BACKGROUND - 130.0)
+    found = lines_in(exposed(with_line(drawn, start, end, level=BACKGROUND + 15.0)))
+    assert any(follows(line, start, end) for line in found)
+
+
 def test_a_needle_behind_a_rod_is_one_line() -> None:
     rod = Rod((-50.0, 2.0, 215.0), (80.0, -6.0, 215.0), diameter_mm=3.0)
     world = replace(WORLDS["dark"], rods=(rod,))
     hidden = seen_at(world)
     for image, truth_px in zip(hidden.images, RIG.project(hidden.truth.centerline_mm), strict=True):
-        along = [np.mean(off_polyline(line.points_px, truth_px) < REDUCED_PX) for line in lines_in(image)]
+        along = [np.mean(distance_from_curve(line.points_px, truth_px) < REDUCED_PX) for line in lines_in(image)]
         needle = lines_in(image)[int(np.argmax(along))]
         assert max(along) > 0.95
-        missed = off_polyline(truth_px, needle.points_px) > 2 * REDUCED_PX
+        missed = distance_from_curve(truth_px, needle.points_px) > 2 * REDUCED_PX
         # Cone, sleeve, and the 3.5 mm that the rod hides.
         assert 0.5 * missed.sum() < 8.5
 

@@ -11,10 +11,10 @@ from tests.tracking.scenes import RIG
 from needletrack.errors import NeedleNotFound
 from needletrack.geometry import spline
 from needletrack.geometry.camera import Camera
+from needletrack.geometry.spline import distance_from_curve
 from needletrack.records import Float, Reason
-from needletrack.scoring import off_polyline
-from needletrack.tracking.axis import AxisObservations
 from needletrack.tracking.fit import CurveFit, EndObservation, FitParameters, fit_curve, initial_curve
+from needletrack.tracking.silhouette import AxisOffsets
 
 N = 171
 LENGTH_MM = 68.0
@@ -57,16 +57,15 @@ def across(camera: Camera, predicted_mm: Float, true_mm: Float) -> tuple[Float, 
 
 def observation(
     center: Float, normal: Float, offset_px: Float, seen: Seen | None = None, sigma_px: float = SIGMA_PX
-) -> AxisObservations:
+) -> AxisOffsets:
     n = len(center)
     sigma = np.where(np.ones(n, np.bool_) if seen is None else seen, sigma_px, np.inf)
-    nothing = np.zeros((2, n))
-    return AxisObservations(center, normal, offset_px, sigma, np.full(n, 5.0), np.isfinite(sigma), nothing, nothing)
+    return AxisOffsets(center, normal, offset_px, sigma)
 
 
 def observed(
     predicted_mm: Float, true_mm: Float, noise_px: tuple[Float, Float] | None = None, seen: Seen | None = None
-) -> tuple[AxisObservations, AxisObservations]:
+) -> tuple[AxisOffsets, AxisOffsets]:
     """Both views of a true curve across a predicted one; seen (2, N)."""
     pose = RIG.right_from_left
     local = ((RIG.left, predicted_mm, true_mm), (RIG.right, pose.apply(predicted_mm), pose.apply(true_mm)))
@@ -103,7 +102,7 @@ def test_exact_observations_give_the_exact_curve(radius_mm: float, within_mm: fl
     for _ in range(4):
         fits.append(fit_curve(points_mm, observed(points_mm, true_mm), RIG, NO_PRIOR))
         points_mm = fits[-1].points_mm
-    assert off_polyline(points_mm, true_mm).max() < within_mm
+    assert distance_from_curve(points_mm, true_mm).max() < within_mm
     assert fits[-1].rms_px < 1e-3
     assert spline.arc_length(points_mm)[-1] == pytest.approx(LENGTH_MM, abs=2.5)
 
@@ -113,7 +112,7 @@ def test_the_bending_prior_costs_little() -> None:
     fit = fit_curve(points_mm, observed(points_mm, true_mm), RIG, PARAMETERS)
     # A constant bend is free; only the ends, which are half as well held, give way to it, and by far less than they
     # are said to be known.
-    assert off_polyline(fit.points_mm, true_mm).max() < 0.1 * sigma_mm(fit).min()
+    assert distance_from_curve(fit.points_mm, true_mm).max() < 0.1 * sigma_mm(fit).min()
 
 
 def test_a_curve_has_derivatives_of_its_own() -> None:
@@ -253,7 +252,7 @@ def test_outliers_count_for_little() -> None:
     noise[1, 20:24] = -3.0
     clean = fit_curve(points_mm, observed(points_mm, true_mm), RIG, PARAMETERS)
     fit = fit_curve(points_mm, observed(points_mm, true_mm, (noise[0], noise[1])), RIG, PARAMETERS)
-    off_mm = off_polyline(fit.points_mm, true_mm)
+    off_mm = distance_from_curve(fit.points_mm, true_mm)
     # Twenty sigmas over 4 mm of one view, of which Cauchy's weight leaves a fiftieth: less than two of the curve's own
     # sigmas; and nothing two correlation lengths away. As a plain mean it would be 2 px / 5.6 px per mm = 0.36 mm.
     assert off_mm.max() < 2 * sigma_mm(clean)[N // 2]
@@ -311,16 +310,6 @@ def test_a_view_that_sees_nothing_holds_no_curve(blind_view: int) -> None:
     assert (refused.value.stage, refused.value.reason) == ("fit", Reason.LOW_COVERAGE)
 
 
-def test_a_hold_keeps_the_unseen_near_the_prediction() -> None:
-    true_mm = arc(BENT, beyond_mm=8.0)
-    points_mm = displaced(arc(BENT), 1.0)
-    seen = seen_but(1, slice(40, N))
-    free = fit_curve(points_mm, observed(points_mm, true_mm, seen=seen), RIG, PARAMETERS)
-    held = fit_curve(points_mm, observed(points_mm, true_mm, seen=seen), RIG, PARAMETERS, hold_mm=0.2)
-    gone_mm = [float(np.linalg.norm(fit.points_mm[-1] - points_mm[-1])) for fit in (free, held)]
-    assert gone_mm[1] < 0.5 * gone_mm[0]
-
-
 def zigzag(rng: np.random.Generator, points_mm: Float) -> Float:
     return points_mm + rng.normal(0.0, 0.3, points_mm.shape) * [0.3, 0.3, 1.0]
 
@@ -332,7 +321,7 @@ def test_triangulated_points_start_a_smooth_evenly_spaced_curve(shape: Callable[
     confidence = np.ones(len(sparse_mm))
     curve_mm = initial_curve(zigzag(np.random.default_rng(4), sparse_mm), confidence, 0.4, PARAMETERS)
     # 0.3 mm of skeleton noise in depth, averaged by a curve of 10 mm per three points: 0.1 mm, more at the ends.
-    assert off_polyline(curve_mm[5:-5], true_mm).max() < 0.5
+    assert distance_from_curve(curve_mm[5:-5], true_mm).max() < 0.5
     assert spline.arc_length(curve_mm)[-1] == pytest.approx(spline.arc_length(true_mm)[-1], rel=0.05)
     steps = np.linalg.norm(np.diff(curve_mm, axis=0), axis=1)
     np.testing.assert_allclose(steps, 0.4, rtol=0.02)
@@ -345,5 +334,5 @@ def test_points_without_confidence_have_no_say_at_the_start() -> None:
     confidence[30:45] = 0.01
     curve_mm = initial_curve(points_mm, confidence, 0.4, PARAMETERS)
     # Of 30 mm, a weight of 1e-4 against a stiff curve held at both ends of the stretch leaves a few percent.
-    assert off_polyline(curve_mm, true_mm).max() < 1.0
-    assert off_polyline(initial_curve(points_mm, np.ones_like(confidence), 0.4, PARAMETERS), true_mm).max() > 5.0
+    assert distance_from_curve(curve_mm, true_mm).max() < 1.0
+    assert distance_from_curve(initial_curve(points_mm, np.ones_like(confidence), 0.4, PARAMETERS), true_mm).max() > 5.0

@@ -38,7 +38,7 @@ PAGE = Path(__file__).parents[2] / "docs" / "status.md"
 def good() -> Refined:
     """A needle against which nothing speaks."""
     p = TrackingParameters()
-    models = RefineModels(p.needle, p.workspace, p.axis, p.fit, p.ends, p.refine)
+    models = RefineModels(p.needle, p.workspace, p.beside, p.fit, p.ends, p.tip, p.refine)
     return refine(scene("dark").images, RIG, scene("dark").truth.centerline_mm, models)
 
 
@@ -83,10 +83,11 @@ def with_tip_sigma(wanted_mm: float) -> Refined:
     """The good needle, its tip's largest standard deviation in any direction being the wanted one."""
 
     def excess(sigma_mm: float) -> float:
-        covariance = with_tip(sigma_mm=(0.0, sigma_mm)).tip_covariance_mm2
+        covariance = with_tip(sigma_mm=(sigma_mm, sigma_mm)).tip_covariance_mm2
         return float(np.sqrt(np.linalg.eigvalsh(covariance)[-1])) - wanted_mm
 
-    return with_tip(sigma_mm=(0.0, brentq(excess, 0.0, 2.0)))
+    each_mm = brentq(excess, 1e-3, 4.0)
+    return with_tip(sigma_mm=(each_mm, each_mm))
 
 
 def with_tip(**changes: object) -> Refined:
@@ -142,7 +143,7 @@ def test_a_weakness_is_told_beyond_its_threshold(reason: Reason, threshold: floa
 
 def test_what_is_not_known_is_weak() -> None:
     assert reasons(replace(good(), base_is_known=False)) == (Reason.AMBIGUOUS_BASE,)
-    assert reasons(with_tip(is_free=False)) == (Reason.TIP_NOT_SEEN,)
+    assert reasons(replace(good(), tip_is_free=False)) == (Reason.TIP_NOT_SEEN,)
     assert reasons(quality=replace(GOOD, coverage=None)) == (Reason.LOW_COVERAGE,)
 
 

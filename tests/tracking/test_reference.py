@@ -72,7 +72,7 @@ def lab() -> Recording:
     return Recording("lab-a")
 
 
-def off_polyline(points: Float, line: Float) -> Float:
+def distance_from_curve(points: Float, line: Float) -> Float:
     """Distance (N,) of each point (N, D) from a polyline (M, D)."""
     start, step = line[:-1], np.diff(line, axis=0)
     along = ((points[:, None] - start) * step).sum(-1) / (step**2).sum(-1)
@@ -262,7 +262,7 @@ def test_the_projection_error_is_bounded_by_the_threshold_and_blind_to_the_shape
     assert found.error.distances_px[:, 0].max() < 1e-9
     assert found.error.distances_px[:, 1].max() <= 1.5 * threshold_px(f, found.left.points_px, 1e-4).max()
     truth_mm = np.array(lab.frames[2]["centerline_mm"])
-    assert rms(off_polyline(found.points_mm, truth_mm)) > 10
+    assert rms(distance_from_curve(found.points_mm, truth_mm)) > 10
 
 
 def test_eq_8_as_printed_lets_pairs_through_that_lie_far_off(lab: Recording) -> None:
@@ -286,7 +286,7 @@ def test_both_polarities_of_the_lab_are_segmented(lab: Recording) -> None:
         for number, image in enumerate((pair.left.image, pair.right.image)):
             points_px = skeleton(segment(image, ReferenceParameters()))
             seen_px = projections_px[number][np.array(truth["visible"][number], dtype=bool)]
-            assert np.mean(off_polyline(points_px, projections_px[number]) < 3) > 0.95
+            assert np.mean(distance_from_curve(points_px, projections_px[number]) < 3) > 0.95
             nearest_px = np.linalg.norm(seen_px[:, None] - points_px, axis=2).min(axis=1)
             assert np.mean(nearest_px < 3) > 0.95
 
@@ -346,7 +346,7 @@ def test_the_lab_is_as_good_and_as_bad_as_measured_before(lab: Recording) -> Non
     for pair, truth in zip(lab.pairs, lab.frames, strict=True):
         track = track_reference(pair, lab.rig)
         assert track.curve is not None
-        errors_mm.append(rms(off_polyline(track.curve.points_mm, np.array(truth["centerline_mm"]))))
+        errors_mm.append(rms(distance_from_curve(track.curve.points_mm, np.array(truth["centerline_mm"]))))
         found.append(track.quality.coverage)
         found_at_1e_3.append(track_reference(pair, lab.rig, ReferenceParameters(threshold=1e-3)).quality.coverage)
     assert 0.2 < float(np.median(errors_mm)) < 0.5
@@ -359,7 +359,7 @@ def test_its_sigmas_hold(lab: Recording) -> None:
     for pair, truth in zip(lab.pairs, lab.frames, strict=True):
         curve = track_reference(pair, lab.rig).curve
         assert curve is not None
-        inside.append(off_polyline(curve.points_mm, np.array(truth["centerline_mm"])) <= 2 * curve.sigma_mm)
+        inside.append(distance_from_curve(curve.points_mm, np.array(truth["centerline_mm"])) <= 2 * curve.sigma_mm)
     assert np.concatenate(inside).mean() > 0.95
 
 

@@ -29,6 +29,15 @@ def unit(vectors: npt.ArrayLike) -> Float:
     return np.asarray(array / np.maximum(np.linalg.norm(array, axis=-1, keepdims=True), 1e-300))
 
 
+def distance_from_curve(points: npt.ArrayLike, curve: npt.ArrayLike) -> Float:
+    """Distance (N,) of each point (N, D) from a polyline (M, D)."""
+    at, line = np.asarray(points, dtype=np.float64), np.asarray(curve, dtype=np.float64)
+    start, step = line[:-1], np.diff(line, axis=0)
+    along = ((at[:, None] - start) * step).sum(-1) / np.maximum((step**2).sum(-1), 1e-12)
+    nearest = start + np.clip(along, 0, 1)[..., None] * step
+    return np.asarray(np.linalg.norm(at[:, None] - nearest, axis=-1).min(axis=1))
+
+
 def tangents(points: npt.ArrayLike) -> Float:
     """Unit tangents (N, D) of a polyline (N, D), by central differences."""
     return unit(np.gradient(np.asarray(points, dtype=np.float64), axis=0))

@@ -11,12 +11,12 @@ import cv2
 import numpy as np
 from markupsafe import Markup
 
-from needletrack.geometry.spline import arc_length, unit
+from needletrack.geometry.spline import arc_length, distance_from_curve, unit
 from needletrack.geometry.stereo import StereoRig
 from needletrack.records import Float, NeedleCurve, NeedleTrack, StereoPair
 from needletrack.report.svg import Element, Panel, digits, drawing, element, markup, tick_text, ticks
 from needletrack.report.views import View, data_uri, stretched, stretches
-from needletrack.scoring import TrueShape, off_polyline
+from needletrack.scoring import TrueShape
 
 WIDTH_PX = 1180
 _LEFT_PX, _RIGHT_PX = 116, 12
@@ -234,7 +234,7 @@ def _draw_sigmas(
     truth: TrueShape | None,
     max_sigma_mm: float,
 ) -> Panel:
-    off_mm = None if truth is None else off_polyline(curve.points_mm, truth.centerline_mm)
+    off_mm = None if truth is None else distance_from_curve(curve.points_mm, truth.centerline_mm)
     values = np.concatenate([2 * curve.sigma_mm, [max_sigma_mm], [] if off_mm is None else off_mm])
     # Linear as long as that shows the usual; a sigma that runs away at an end must not flatten the rest.
     log = bool(values.max() > 12 * np.median(curve.sigma_mm))

@@ -17,6 +17,8 @@ from needletrack.tracking.segment import Mask, Ridges
 # Shorter pieces have no direction that could be continued; reduced px.
 _MIN_PIECE_PX = 6
 _END_PX = 10
+# A corner is a turn within so many pixels to either side.
+_CORNER_PX = 6
 _WIDTH_STEP = 0.5
 # Blur widens a line, and a skeleton's width is coarse: only what is clearly too wide is left out here.
 _WIDTH_ALLOWANCE = 1.5
@@ -59,7 +61,7 @@ def trace_centerlines(
     pieces: list[_Piece] = []
     for mask in (ridges.bright, ridges.dark):
         for points in _skeleton_pieces(mask):
-            pieces.extend(_two_sided(points, ridges, reach, parameters.min_contrast_gray))
+            pieces.extend(_two_sided(points, ridges, reach, parameters))
     chains = _linked(pieces, parameters.max_gap_mm * px_per_mm / ridges.reduction, parameters.max_turn_deg)
     lines = [_centerline(chain, ridges.reduction) for chain in chains]
     return sorted(lines, key=lambda line: -float(arc_length(line.points_px)[-1]))
@@ -110,8 +112,11 @@ def _walk(pixels: list[int], width: int) -> npt.NDArray[np.int64]:
     return np.array(path)
 
 
-def _two_sided(points: Float, ridges: Ridges, max_width: float, min_contrast: float) -> list[_Piece]:
-    """The stretches of a piece that differ from both sides: an edge of something wide differs from one only."""
+def _two_sided(points: Float, ridges: Ridges, max_width: float, parameters: CenterlineParameters) -> list[_Piece]:
+    """The stretches of a piece that differ from both sides: an edge of something wide differs from one only.
+
+    They end at corners too, where a skeleton goes over from the needle to the edge of its sleeve.
+    """
     smooth = uniform_filter1d(points, 5, axis=0, mode="nearest")
     along = tangents(smooth)
     normal = np.column_stack([-along[:, 1], along[:, 0]])
@@ -124,13 +129,25 @@ def _two_sided(points: Float, ridges: Ridges, max_width: float, min_contrast: fl
     darker = np.minimum(*(-differences).max(axis=1))
     contrast = np.maximum(brighter, darker)
     width = _WIDTH_STEP * (np.abs(differences) < side_contrast[:, None] / 2).argmin(axis=1).sum(axis=0) + _WIDTH_STEP
-    good = (uniform_filter1d(contrast, 5, mode="nearest") > min_contrast) & (
+    good = (uniform_filter1d(contrast, 5, mode="nearest") > parameters.min_contrast_gray) & (
         median_filter(width, 9, mode="nearest") <= max_width
     )
+    good &= _turn_deg(smooth) < parameters.max_turn_deg
     edges = np.flatnonzero(np.diff(np.concatenate([[0], good.astype(np.int8), [0]])))
     return [
         _Piece(smooth[a:b], width[a:b]) for a, b in zip(edges[::2], edges[1::2], strict=True) if b - a >= _MIN_PIECE_PX
     ]
+
+
+def _turn_deg(points: Float) -> Float:
+    """By how much (N,) a line turns about each of its points (N, 2); 0 near its ends."""
+    turn = np.zeros(len(points))
+    if len(points) > 2 * _CORNER_PX:
+        chord = points[_CORNER_PX:] - points[:-_CORNER_PX]
+        before, after = chord[:-_CORNER_PX], chord[_CORNER_PX:]
+        cross = before[:, 0] * after[:, 1] - before[:, 1] * after[:, 0]
+        turn[_CORNER_PX:-_CORNER_PX] = np.degrees(np.abs(np.arctan2(cross, (before * after).sum(axis=1))))
+    return turn
 
 
 def _sample(image: npt.NDArray[np.float32], points: Float) -> Float:

@@ -7,11 +7,13 @@ the stated covariance says so.
 """
 
 from dataclasses import dataclass
+from functools import lru_cache
+from typing import Protocol
 
 import numpy as np
 import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict, Field
-from scipy.linalg import LinAlgError, cho_factor, cho_solve
+from scipy.linalg.lapack import dposv
 
 from needletrack.errors import NeedleNotFound
 from needletrack.geometry.camera import Camera
@@ -19,11 +21,11 @@ from needletrack.geometry.spline import arc_length, basis, resample, tangents
 from needletrack.geometry.stereo import StereoRig
 from needletrack.geometry.transform import RigidTransform
 from needletrack.records import Float, Reason
-from needletrack.tracking.axis import AxisObservations
 from needletrack.tracking.needle import Positive
 
 # Points triangulated from two skeletons scatter by about this much.
 _SKELETON_SIGMA_MM = 0.3
+_IDENTITY = RigidTransform.identity()
 
 
 class FitParameters(BaseModel):
@@ -37,8 +39,13 @@ class FitParameters(BaseModel):
     )
     robust_px: Positive = Field(0.3, description="Offsets beyond this count for less and less (Cauchy), px.")
     correlation_mm: Positive = Field(
-        3.0, description="Errors of neighbouring axis points are one error over this length, mm."
+        1.0, description="Noise of neighbouring axis points is one error over this length, mm."
     )
+    systematic_px: tuple[Positive, Positive] = Field(
+        (0.02, 0.12),
+        description="What pulls the axis aside all along a stretch, px: of a dull inside, and of a lively one.",
+    )
+    systematic_mm: Positive = Field(15.0, description="Length of such a stretch, mm.")
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,87 +106,146 @@ class EndObservation:
     sigma_px: float
 
 
+class AcrossObservations(Protocol):
+    """What one view shows across a curve of N points, as `AxisOffsets` does."""
+
+    @property
+    def center_px(self) -> Float:
+        """Where each cross section was taken, raw px (N, 2)."""
+
+    @property
+    def normal(self) -> Float:
+        """Its direction, (N, 2)."""
+
+    @property
+    def offset_px(self) -> Float:
+        """The axis along it, (N,)."""
+
+    @property
+    def sigma_px(self) -> Float:
+        """Its standard deviation (N,), infinite where the needle is not seen."""
+
+    @property
+    def seen(self) -> npt.NDArray[np.bool_]:
+        """Where the needle is seen, (N,)."""
+
+
 Ends = tuple[tuple[EndObservation, ...], tuple[EndObservation, ...]]
 
 
 def fit_curve(
     points_mm: Float,
-    observed: tuple[AxisObservations, AxisObservations],
+    observed: tuple[AcrossObservations, AcrossObservations],
     rig: StereoRig,
     parameters: FitParameters,
     ends: Ends = ((), ()),
-    hold_mm: float | None = None,
+    systematic_px: float = 0.0,
 ) -> CurveFit:
     """The curve that both views' axis observations across a predicted curve (N, 3), evenly spaced, agree on.
 
     `ends` are the ends that the left and the right view show; they fix the depth of a needle along the epipolar lines.
-    hold_mm keeps the curve within about that distance of the prediction where nothing is seen: for the way to the
-    answer, not for the answer, whose covariance it would flatter. Raises NeedleNotFound where nothing holds a curve.
+    systematic_px: what a view's axis may be off by all along a stretch, which the covariance then says (Huber's
+    sandwich); 0 leaves that, and its cost, out.
+    Raises NeedleNotFound where nothing holds a curve.
     """
-    if not (observed[0].seen.any() and observed[1].seen.any()):
-        raise NeedleNotFound("fit", Reason.LOW_COVERAGE)
-    length = arc_length(points_mm)
-    u = length / length[-1]
-    count = _control_count(float(length[-1]), parameters)
-    b = basis(u, count)
-    control = np.linalg.lstsq(b, points_mm, rcond=None)[0]
-    prior = _prior_matrix(points_mm, b, float(length[-1]), count, parameters, hold_mm)
-    views = [
-        _View(camera, pose, seen, end)
-        for camera, pose, seen, end in zip(
-            (rig.left, rig.right),
-            (RigidTransform.identity(), rig.right_from_left),
-            observed,
-            ends,
-            strict=True,
-        )
-    ]
-    share = min(1.0, float(length[-1]) / (len(points_mm) - 1) / parameters.correlation_mm)
-    smooth = _smoothness_matrix(count, float(length[-1]), parameters)
-    normal = prior + smooth
-    # On the way the next round corrects what two steps leave.
-    for _ in range(4 if hold_mm is None else 2):
-        normal = prior + smooth
-        gradient = -(smooth @ control.ravel())
-        points = b @ control
-        for view in views:
-            residual, jacobian = view.linearized(points)
-            weight = np.where(view.is_across, share, 1.0) / view.sigma_px**2
-            weight /= 1 + (residual / np.maximum(parameters.robust_px, view.sigma_px)) ** 2
-            # One row per point and view: d(offset)/d(control) = basis (x) d(offset)/d(point).
-            rows = (b[view.index][:, :, None] * jacobian[:, None, :]).reshape(len(residual), 3 * count)
-            normal += rows.T @ (weight[:, None] * rows)
-            gradient += rows.T @ (weight * residual)
-        try:
-            factor = cho_factor(normal)
-        except (LinAlgError, ValueError) as error:
-            raise NeedleNotFound("fit", Reason.HIGH_UNCERTAINTY) from error
-        step = cho_solve(factor, gradient).reshape(control.shape)
-        control = control + step
-        if np.abs(step).max() < 1e-3:
-            break
-    points = b @ control
-    if not np.isfinite(points).all():
-        raise NeedleNotFound("fit", Reason.HIGH_UNCERTAINTY)
-    residuals = np.full((2, len(points)), np.nan)
-    normalized = []
-    for row, view in zip(residuals, views, strict=True):
-        left_over = view.linearized(points)[0]
-        row[view.index[view.is_across]] = left_over[view.is_across]
-        normalized.append(left_over / view.sigma_px)
-    misfit = np.concatenate(normalized) ** 2
-    precision = np.concatenate([view.sigma_px**-2.0 for view in views])
-    rms = float(np.sqrt(misfit.sum() / precision.sum()))
-    excess = max(1.0, float(misfit.mean()))
-    covariance = np.asarray(excess * cho_solve(cho_factor(normal), np.eye(len(normal))), dtype=np.float64)
-    return CurveFit(u, np.asarray(control, dtype=np.float64), covariance, points, residuals, rms)
+    return CurveFitting(points_mm, rig, parameters).fit(observed, ends, systematic_px)
+
+
+class CurveFitting:
+    """Fits about one predicted curve (N, 3), one after another: see `fit_curve`."""
+
+    def __init__(self, points_mm: Float, rig: StereoRig, parameters: FitParameters) -> None:
+        self._rig, self._parameters = rig, parameters
+        self._length = arc_length(points_mm)
+        whole = float(self._length[-1])
+        self._u = self._length / whole
+        count = _control_count(whole, parameters)
+        self._basis = basis(self._u, count)
+        self._start: Float = np.asarray(np.linalg.lstsq(self._basis, points_mm, rcond=None)[0], dtype=np.float64)
+        self._control = self._start
+        self._smooth = _smoothness_matrix(count, whole, parameters)
+        self._held = _prior_matrix(points_mm, self._basis, whole, count, parameters) + self._smooth
+        self._share = min(1.0, whole / (len(points_mm) - 1) / parameters.correlation_mm)
+
+    def points_mm(self) -> Float:
+        """The curve (N, 3) so far; raises NeedleNotFound where it is none."""
+        points = self._basis @ self._control
+        if not np.isfinite(points).all():
+            raise NeedleNotFound("fit", Reason.HIGH_UNCERTAINTY)
+        return np.asarray(points)
+
+    def approach(
+        self, observed: tuple[AcrossObservations, AcrossObservations], ends: Ends = ((), ())
+    ) -> tuple[list["_View"], Float, list[tuple[Float, Float]]]:
+        """Gauss-Newton rounds towards the observations: the views, normal matrix, and what pulls where in each view."""
+        if not (observed[0].seen.any() and observed[1].seen.any()):
+            raise NeedleNotFound("fit", Reason.LOW_COVERAGE)
+        views = [
+            _View(camera, pose, seen, end)
+            for camera, pose, seen, end in zip(
+                (self._rig.left, self._rig.right), (_IDENTITY, self._rig.right_from_left), observed, ends, strict=True
+            )
+        ]
+        weights = [np.where(view.is_across, self._share, 1.0) / view.sigma_px**2 for view in views]
+        mixings = [self._basis[view.index] for view in views]
+        # Where no view holds the curve it stays where it was predicted.
+        self._control = self._start
+        normal = self._held
+        pulls: list[tuple[Float, Float]] = []
+        for _ in range(4):
+            normal = self._held.copy()
+            gradient = -(self._smooth @ self._control.ravel())
+            points = self._basis @ self._control
+            pulls = []
+            for view, weight, mixing in zip(views, weights, mixings, strict=True):
+                residual, jacobian = view.linearized(points)
+                robust = weight / (1 + (residual / np.maximum(self._parameters.robust_px, view.sigma_px)) ** 2)
+                # One row per point and view: d(offset)/d(control) = basis (x) d(offset)/d(point).
+                rows = (mixing[:, :, None] * jacobian[:, None, :]).reshape(len(residual), -1)
+                weighted = (robust[:, None] * rows).T
+                normal += weighted @ rows
+                gradient += weighted @ residual
+                pulls.append((weighted[:, view.is_across], self._length[view.index[view.is_across]]))
+            step = _solved(normal, gradient).reshape(self._control.shape)
+            self._control = self._control + step
+            if np.abs(step).max() < 1e-3:
+                break
+        return views, normal, pulls
+
+    def fit(
+        self,
+        observed: tuple[AcrossObservations, AcrossObservations],
+        ends: Ends = ((), ()),
+        systematic_px: float = 0.0,
+    ) -> CurveFit:
+        """The curve that the observations agree on, with what is left over and its covariance."""
+        views, normal, pulls = self.approach(observed, ends)
+        points = self.points_mm()
+        residuals = np.full((2, len(points)), np.nan)
+        normalized = []
+        for row, view in zip(residuals, views, strict=True):
+            left_over = view.linearized(points)[0]
+            row[view.index[view.is_across]] = left_over[view.is_across]
+            normalized.append(left_over / view.sigma_px)
+        misfit = np.concatenate(normalized) ** 2
+        precision = np.concatenate([view.sigma_px**-2.0 for view in views])
+        rms = float(np.sqrt(misfit.sum() / precision.sum()))
+        excess = max(1.0, float(misfit.mean()))
+        spread = _solved(normal, np.eye(len(normal)))
+        covariance = excess * spread
+        for pull, at in pulls if systematic_px > 0 else ():
+            alike = systematic_px**2 * np.exp(-np.abs(at[:, None] - at) / self._parameters.systematic_mm)
+            gain = spread @ pull
+            covariance = covariance + gain @ alike @ gain.T
+        control = np.asarray(self._control, dtype=np.float64)
+        return CurveFit(self._u, control, np.asarray(covariance), points, residuals, rms)
 
 
 class _View:
     """One view's observations in undistorted pixels, ready for linearising."""
 
     def __init__(
-        self, camera: Camera, pose: RigidTransform, seen: AxisObservations, ends: tuple[EndObservation, ...]
+        self, camera: Camera, pose: RigidTransform, seen: AcrossObservations, ends: tuple[EndObservation, ...]
     ) -> None:
         across = np.flatnonzero(seen.seen)
         at_ends = np.array([end.index for end in ends], dtype=np.int64)
@@ -191,27 +257,37 @@ class _View:
         normal[len(across) :] = np.column_stack([normal[len(across) :, 1], -normal[len(across) :, 0]])
         offset = np.concatenate([seen.offset_px[across], [end.shift_px for end in ends]])
         center = seen.center_px[self.index]
-        self.target_px = camera.undistort(center + offset[:, None] * normal)
-        ahead = camera.undistort(center + normal) - camera.undistort(center)
+        undistorted = camera.undistort(np.concatenate([center + offset[:, None] * normal, center + normal, center]))
+        self.target_px, there, here = undistorted.reshape(3, -1, 2)
+        ahead = there - here
         self.normal = ahead / np.maximum(np.linalg.norm(ahead, axis=1, keepdims=True), 1e-12)
         self._camera, self._pose = camera, pose
 
     def linearized(self, points_mm: Float) -> tuple[Float, Float]:
         """Offsets (K,) still missing across the curve, px, and their derivatives (K, 3) by the points in space."""
         local = self._pose.apply(points_mm[self.index])
-        fx, fy = self._camera.matrix[0, 0], self._camera.matrix[1, 1]
-        x, y = local[:, 0] / local[:, 2], local[:, 1] / local[:, 2]
-        projected = np.column_stack([x, y, np.ones_like(x)]) @ self._camera.matrix[:2].T
-        nx, ny = self.normal[:, 0] * fx / local[:, 2], self.normal[:, 1] * fy / local[:, 2]
-        by_local = np.column_stack([nx, ny, -nx * x - ny * y])
-        residual = ((self.target_px - projected) * self.normal).sum(axis=1)
+        depth = local[:, 2:]
+        ray = local[:, :2] / depth
+        matrix = self._camera.matrix
+        residual = ((self.target_px - ray @ matrix[:2, :2].T - matrix[:2, 2]) * self.normal).sum(axis=1)
+        by_ray = self.normal * (matrix[[0, 1], [0, 1]] / depth)
+        by_local = np.concatenate([by_ray, -(by_ray * ray).sum(axis=1, keepdims=True)], axis=1)
         return np.asarray(residual), np.asarray(by_local @ self._pose.rotation)
+
+
+def _solved(normal: Float, right: Float) -> Float:
+    """normal^-1 right; raises NeedleNotFound where the matrix is not positive definite."""
+    _, solution, info = dposv(normal, right)
+    if info != 0:
+        raise NeedleNotFound("fit", Reason.HIGH_UNCERTAINTY)
+    return np.asarray(solution, dtype=np.float64)
 
 
 def _control_count(length_mm: float, parameters: FitParameters) -> int:
     return int(np.clip(round(length_mm / parameters.control_spacing_mm) + 3, 5, 30))
 
 
+@lru_cache(maxsize=64)
 def _third_derivative(count: int) -> Float:
     middles = (np.arange(count - 3) + 0.5) / (count - 3)
     return basis(middles, count, derivative=3)
@@ -219,17 +295,18 @@ def _third_derivative(count: int) -> Float:
 
 def _smoothness_matrix(count: int, length_mm: float, parameters: FitParameters) -> Float:
     """Prior on the third derivative by arc length, which for a needle is the change of its curvature."""
-    third = _third_derivative(count) / length_mm**3
-    weight = 1 / parameters.curvature_change_per_mm2**2
-    return np.asarray(np.kron(weight * third.T @ third, np.eye(3)), dtype=np.float64)
+    return _third_derivative_squared(count) / (parameters.curvature_change_per_mm2 * length_mm**3) ** 2
 
 
-def _prior_matrix(
-    points_mm: Float, b: Float, length_mm: float, count: int, parameters: FitParameters, hold_mm: float | None
-) -> Float:
+@lru_cache(maxsize=64)
+def _third_derivative_squared(count: int) -> Float:
+    third = _third_derivative(count)
+    return np.asarray(np.kron(third.T @ third, np.eye(3)), dtype=np.float64)
+
+
+def _prior_matrix(points_mm: Float, b: Float, length_mm: float, count: int, parameters: FitParameters) -> Float:
     """Holds the points along the curve, where no view sees a motion, and everything to a metre: never singular."""
     along = tangents(points_mm)
     rows = (b[:, :, None] * along[:, None, :]).reshape(len(b), 3 * count)
     per_point = length_mm / len(b) / parameters.correlation_mm
-    held = np.zeros((3 * count, 3 * count)) if hold_mm is None else np.kron(b.T @ b, np.eye(3)) / hold_mm**2
-    return np.asarray(per_point * (rows.T @ rows / 0.3**2 + held) + np.eye(3 * count) / 1000.0**2)
+    return np.asarray(per_point * rows.T @ rows / 0.3**2 + np.eye(3 * count) / 1000.0**2)

@@ -29,9 +29,9 @@ class GateParameters(BaseModel):
         description="Largest stated sigma along the shape (95th percentile) and of the tip, mm; 1 mm is 2.5 of it.",
     )
     max_reprojection_rms_px: Positive = Field(
-        0.45, description="Largest rms of the axis points about the projected curve, px."
+        0.12, description="Largest rms of the axis points about the projected curve, px."
     )
-    min_coverage: float = Field(0.85, ge=0, le=1, description="Smallest share of the length that both cameras see.")
+    min_coverage: float = Field(0.5, ge=0, le=1, description="Smallest share of the length that both cameras see.")
     max_epipolar_share: float = Field(
         0.5,
         ge=0,
@@ -42,8 +42,8 @@ class GateParameters(BaseModel):
         12.0, description="A stretch closer than this to the epipolar lines has no depth of its own."
     )
     min_tip_contrast: Positive = Field(
-        15.0,
-        description="Height of the needle's signal at the tip over its scatter and over the rest beyond, in each view.",
+        8.0,
+        description="Sigmas by which each view prefers an end there to a needle that goes on, and to none.",
     )
     max_tip_disagreement_mm: Positive = Field(
         0.5, description="Largest distance along the needle between both views' tips, mm."
@@ -87,7 +87,7 @@ def weaknesses(
         Reason.HIGH_RESIDUAL: refined.fit.rms_px > parameters.max_reprojection_rms_px,
         Reason.HIGH_UNCERTAINTY: float(np.percentile(curve.sigma_mm, 95)) > parameters.max_sigma_mm
         or float(np.sqrt(np.linalg.eigvalsh(refined.tip_covariance_mm2)[-1])) > parameters.max_sigma_mm,
-        Reason.TIP_NOT_SEEN: min(tip.contrast) < parameters.min_tip_contrast or not tip.is_free,
+        Reason.TIP_NOT_SEEN: min(tip.contrast) < parameters.min_tip_contrast or not refined.tip_is_free,
         Reason.TIP_DISAGREES: abs(tip.each_mm[0] - tip.each_mm[1]) > parameters.max_tip_disagreement_mm
         or (quality.epipolar_rms_px or 0.0) > parameters.max_tip_epipolar_px,
         Reason.JUMP: previous is not None

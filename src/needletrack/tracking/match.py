@@ -3,7 +3,8 @@
 A left point's partners are the places where its epipolar line crosses the right line, read off the sign changes of the
 distance map (paper eq. 9, in pixels) to a fraction of a pixel. Dynamic programming then picks the longest chain of
 partners that keeps the order along both lines and leaps nowhere in space, which the paper's threshold does not ask
-for. A stretch along the epipolar lines has no crossings and goes without a partner.
+for. A stretch along the epipolar lines has no crossings and goes without a partner; lines that run along them as a
+whole are matched by their ends.
 """
 
 from dataclasses import dataclass
@@ -14,7 +15,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from needletrack.errors import NeedleNotFound
 from needletrack.geometry.camera import Camera
-from needletrack.geometry.epipolar import epipolar_distance_map_px
+from needletrack.geometry.epipolar import epipolar_distance_map_px, homogeneous
 from needletrack.geometry.spline import arc_length
 from needletrack.geometry.stereo import StereoRig
 from needletrack.geometry.triangulation import triangulate
@@ -28,7 +29,7 @@ class MatchParameters(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     max_candidates: int = Field(
-        3, ge=1, description="So many of the best left-right pairs of lines are examined in full."
+        3, ge=1, description="So many of the best stretches that both views show are examined in full."
     )
     step_px: Positive = Field(4.0, description="Spacing of the points along each line that are matched, px.")
     max_gap_mm: Positive = Field(12.0, description="Longest stretch in the middle of the needle without a match, mm.")
@@ -39,6 +40,17 @@ _MAX_FORESHORTENING = 3.0
 _COARSE_STRIDE = 4
 # Scenes with vessels have up to 100 pairs; a pattern of stripes has thousands, and none of them is a needle.
 _MAX_PAIRS = 150
+# So many are offered; which of them the images support is told later.
+_MAX_CANDIDATES = 12
+# Lines run along the epipolar lines where the sine of the angle is below this.
+_LENGTHWISE = 0.35
+# They are then matched by their ends, where that makes the curve longer than crossings do.
+_LENGTHENS = 1.3
+_MAX_ENDS_APART_PX = 30.0
+# How well a traced line and its ends are known.
+_ACROSS_PX, _ENDS_PX = 1.5, 12.0
+# Precision of the Legendre coefficients of the inverse depth, 1/mm.
+_BEND_PRIOR = (1 / 1e-2**2, 1 / 5e-4**2, 1 / 1e-4**2, 1 / 4e-5**2)
 # Pairs are compared at every depth from half the nearest to four times the furthest of the workspace: a vessel behind
 # it then finds its true partner and is not offered to the needle.
 _DEPTH_MARGIN = (0.5, 4.0)
@@ -50,6 +62,8 @@ class Candidate:
 
     A point's confidence is the sine of the angle at which the line crosses the epipolar line: near zero, the depth
     is not fixed. `length_mm` is the length of the matched stretch, `score` what it is ranked by.
+    `plausible` in 0..1 is small where both lines have better partners elsewhere, or where the curve runs towards the
+    cameras, as lines do that do not belong together.
     """
 
     left: Centerline
@@ -59,6 +73,21 @@ class Candidate:
     confidence: Float
     length_mm: float
     score: float
+    plausible: float
+
+    def part(self, chosen: npt.NDArray[np.bool_], score: float) -> "Candidate":
+        """The chosen points alone, with their score."""
+        pairs, points_mm = self.correspondences, self.points_mm[chosen]
+        return Candidate(
+            self.left,
+            self.right,
+            Correspondences(pairs.left_undistorted_px[chosen], pairs.right_undistorted_px[chosen]),
+            points_mm,
+            self.confidence[chosen],
+            float(arc_length(points_mm)[-1]),
+            score,
+            self.plausible,
+        )
 
 
 def match_lines(
@@ -74,17 +103,24 @@ def match_lines(
         raise NeedleNotFound("match", Reason.NO_CANDIDATE)
     left_px = [_resampled(line, rig.left, parameters.step_px) for line in left]
     right_px = [_resampled(line, rig.right, parameters.step_px) for line in right]
-    pairs = _exclusive_pairs(left_px, right_px, rig, workspace, parameters)
-    found = []
-    for i, j in pairs.within:
+    pairs = _pairs(left_px, right_px, rig, workspace, parameters)
+    found: list[Candidate] = []
+    crossing_mm: dict[tuple[int, int], float] = {}
+    for i, j, own in pairs.within:
         chain = _best_chain(_crossings(left_px[i], right_px[j], rig, workspace), rig, parameters)
         if chain is not None:
-            candidate = _candidate(left[i], right[j], chain)
-            if candidate.length_mm >= needle.min_length_mm / 2:
-                found.append(candidate)
+            candidate = _candidate(left[i], right[j], chain, own)
+            found.append(candidate)
+            if np.median(candidate.confidence) > _LENGTHWISE / 2:
+                crossing_mm[i, j] = candidate.length_mm
+    for i, j, chain in _lengthwise(left_px, right_px, rig, workspace):
+        candidate = _candidate(left[i], right[j], chain, 1.0)
+        if candidate.length_mm > _LENGTHENS * crossing_mm.get((i, j), 0.0):
+            found.append(candidate)
+    found = [candidate for candidate in found if candidate.length_mm >= needle.min_length_mm / 2]
     if not found:
         raise NeedleNotFound("match", Reason.OUTSIDE_WORKSPACE if pairs.elsewhere else Reason.NO_STEREO_MATCH)
-    return sorted(found, key=lambda c: -c.score)[: parameters.max_candidates]
+    return sorted(found, key=lambda c: -c.score)[:_MAX_CANDIDATES]
 
 
 def inside(workspace: Workspace, points_mm: Float) -> npt.NDArray[np.bool_]:
@@ -143,44 +179,80 @@ def _crossings(left_px: Float, right_px: Float, rig: StereoRig, box: Workspace) 
 
 @dataclass(frozen=True, slots=True)
 class _Pairs:
-    """Lines that are each other's best partners: those within the workspace, and how many there are elsewhere."""
+    """Lines that may be one needle within the workspace, and how many are each other's best partners elsewhere.
 
-    within: list[tuple[int, int]]
+    With each pair comes the share of its stretches that has no better partner elsewhere.
+    """
+
+    within: list[tuple[int, int, float]]
     elsewhere: int
 
 
-def _exclusive_pairs(
+def _pairs(
     left: list[Float], right: list[Float], rig: StereoRig, workspace: Workspace, parameters: MatchParameters
 ) -> _Pairs:
-    """Pairs of lines that are each other's best partners at any depth."""
+    """Pairs of lines that meet in the workspace, but for those that both have their best partners elsewhere.
+
+    Within the workspace a line is offered with every partner: a needle in front of a vessel, or seen as two rims and a
+    streak, has its own among them. What lies elsewhere is exclusive.
+    """
     nearest, furthest = workspace.z_mm.min * _DEPTH_MARGIN[0], workspace.z_mm.max * _DEPTH_MARGIN[1]
     everywhere = Range(min=-furthest, max=furthest)
     anywhere = Workspace(x_mm=everywhere, y_mm=everywhere, z_mm=Range(min=nearest, max=furthest))
     sparse = [points[:: _COARSE_STRIDE if len(points) > 4 * _COARSE_STRIDE else 1] for points in left]
-    chains = []
+    chains, chains_within = [], []
     for i, j in _promising(sparse, right, rig, anywhere):
-        chain = _best_chain(_crossings(sparse[i], right[j], rig, anywhere), rig, parameters)
+        crossings = _crossings(sparse[i], right[j], rig, anywhere)
+        is_within = inside(workspace, crossings.points_mm)
+        chain = _best_chain(crossings, rig, parameters)
         if chain is not None:
             chains.append((i, j, chain))
-    taken_left: dict[int, list[tuple[float, float]]] = {}
-    taken_right: dict[int, list[tuple[float, float]]] = {}
-    within, elsewhere = [], 0
+        if not is_within.all():
+            chain = _best_chain(crossings.take(is_within), rig, parameters)
+        if chain is not None:
+            chains_within.append((i, j, chain))
+    taken, gone = (_Taken({}, {}), _Taken({}, {}))
+    elsewhere = 0
     for i, j, chain in sorted(chains, key=lambda c: -c[2].score):
-        stretches = [(float(at.min()), float(at.max())) for at in (chain.crossings.left_at, chain.crossings.right_at)]
-        if _is_taken(stretches[0], taken_left.get(i, [])) or _is_taken(stretches[1], taken_right.get(j, [])):
+        if max(taken.shares(i, j, chain)) > 0.5:
             continue
-        taken_left.setdefault(i, []).append(stretches[0])
-        taken_right.setdefault(j, []).append(stretches[1])
-        if np.mean(inside(workspace, chain.crossings.points_mm)) > 0.5:
-            within.append((i, j))
-        else:
+        taken.add(i, j, chain)
+        if np.mean(inside(workspace, chain.crossings.points_mm)) <= 0.5:
+            gone.add(i, j, chain)
             elsewhere += 1
+    within = []
+    for i, j, chain in chains_within:
+        shares = gone.shares(i, j, chain)
+        if min(shares) <= 0.5:
+            within.append((i, j, 1 - float(np.mean(shares))))
     return _Pairs(within, elsewhere)
 
 
-def _is_taken(stretch: tuple[float, float], taken: list[tuple[float, float]]) -> bool:
-    length = max(stretch[1] - stretch[0], 1e-9)
-    return any(min(stretch[1], b) - max(stretch[0], a) > length / 2 for a, b in taken)
+_Place = tuple[dict[int, list[tuple[float, float]]], int, Float]
+
+
+@dataclass(frozen=True, slots=True)
+class _Taken:
+    """Stretches, as first and last index, of left and right lines that have found a partner."""
+
+    left: dict[int, list[tuple[float, float]]]
+    right: dict[int, list[tuple[float, float]]]
+
+    def add(self, i: int, j: int, chain: _Chain) -> None:
+        for lines, line, at in self._places(i, j, chain):
+            lines.setdefault(line, []).append((float(at.min()), float(at.max())))
+
+    def shares(self, i: int, j: int, chain: _Chain) -> tuple[float, float]:
+        """How much of the chain's left and of its right stretch is taken."""
+        left, right = (
+            float(np.mean(np.any([(at >= a) & (at <= b) for a, b in lines.get(line, [(1.0, 0.0)])], axis=0)))
+            for lines, line, at in self._places(i, j, chain)
+        )
+        return left, right
+
+    def _places(self, i: int, j: int, chain: _Chain) -> tuple[_Place, _Place]:
+        at = chain.crossings
+        return (self.left, i, at.left_at.astype(np.float64)), (self.right, j, at.right_at)
 
 
 def _promising(left: list[Float], right: list[Float], rig: StereoRig, box: Workspace) -> list[tuple[int, int]]:
@@ -197,18 +269,104 @@ def _promising(left: list[Float], right: list[Float], rig: StereoRig, box: Works
     return [(int(i), int(j)) for i, j in zip(*np.unravel_index(most, votes.shape), strict=True) if votes[i, j] >= 3]
 
 
-def _candidate(left: Centerline, right: Centerline, chain: _Chain) -> Candidate:
+def _candidate(left: Centerline, right: Centerline, chain: _Chain, own: float) -> Candidate:
     found = chain.crossings
     forward = found.right_at[-1] > found.right_at[0]
+    length_mm = float(arc_length(found.points_mm)[-1])
+    # The length across the line of sight: depth that changes without reason makes a curve long.
+    towards = found.points_mm / np.linalg.norm(found.points_mm, axis=1, keepdims=True)
+    step = np.diff(found.points_mm[:: max(1, len(found.points_mm) // 10)], axis=0)
+    depth = (step * towards[: len(step)]).sum(axis=1)
+    across = 1 - float((depth**2).sum() / max((step**2).sum(), 1e-12))
+    plausible = own * across
     return Candidate(
         left,
         right if forward else right.reversed(),
         Correspondences(found.left_px, found.right_px),
         found.points_mm,
         found.sine,
-        float(arc_length(found.points_mm)[-1]),
-        chain.score,
+        length_mm,
+        plausible * chain.score,
+        plausible,
     )
+
+
+def _lengthwise(
+    left: list[Float], right: list[Float], rig: StereoRig, workspace: Workspace
+) -> list[tuple[int, int, _Chain]]:
+    """Pairs of lines that run mostly along the epipolar lines, matched by their ends and by how they bend.
+
+    The inverse depth along the left line is a polynomial that brings it onto the right line, with its ends near the
+    right line's ends: where the lines do not cross the epipolar lines, the ends alone fix the depth.
+    """
+    ends_left, ends_right = (np.concatenate([points[[0, -1]] for points in lines]) for lines in (left, right))
+    apart = epipolar_distance_map_px(rig.fundamental, ends_left, ends_right).reshape(len(left), 2, len(right), 2)
+    chord = np.linalg.norm(ends_right[1::2] - ends_right[::2], axis=1)
+    is_along = np.abs(apart[..., 1] - apart[..., 0]).max(axis=1) < _LENGTHWISE * chord
+    found = []
+    for turned in (False, True):
+        # First end to first end, or to the last one.
+        ends = np.stack([apart[:, 0, :, int(turned)], apart[:, 1, :, 1 - int(turned)]])
+        for i, j in zip(*np.nonzero(is_along & (np.abs(ends).max(axis=0) < _MAX_ENDS_APART_PX)), strict=True):
+            chain = _by_ends(left[i], right[j][::-1] if turned else right[j], rig, workspace)
+            if chain is not None:
+                found.append((int(i), int(j), chain))
+    return found
+
+
+def _by_ends(left_px: Float, right_px: Float, rig: StereoRig, workspace: Workspace) -> _Chain | None:
+    """The left line at the depth that brings it onto the right line, both in the same order; None: not in the box."""
+    ends_mm = triangulate(rig, left_px[[0, -1]], right_px[[0, -1]])
+    # Ends are traced too short or too long: the start may lie somewhat outside.
+    if not ((ends_mm[:, 2] > workspace.z_mm.min / 1.5) & (ends_mm[:, 2] < workspace.z_mm.max * 1.5)).all():
+        return None
+    rays = homogeneous(left_px) @ np.linalg.inv(rig.left.matrix).T
+    pose = rig.right_from_left
+    # A point of the left line at inverse depth q projects to far + q * near, homogeneous.
+    far = rays @ pose.rotation.T @ rig.right.matrix.T
+    near = rig.right.matrix @ pose.translation_mm
+    s = np.linspace(-1.0, 1.0, len(left_px))
+    design = np.polynomial.legendre.legvander(s, 3)
+    first, last = 1 / ends_mm[:, 2]
+    coefficients = np.array([(first + last) / 2, (last - first) / 2, 0.0, 0.0])
+    prior = np.diag(_BEND_PRIOR)
+    segments = np.diff(right_px, axis=0)
+    length = np.maximum(np.linalg.norm(segments, axis=1), 1e-9)
+    along = segments / length[:, None]
+    normal = np.column_stack([-along[:, 1], along[:, 0]])
+
+    def at(c: Float) -> tuple[Float, Float]:
+        q = design @ c
+        h = far + q[:, None] * near
+        px = h[:, :2] / h[:, 2:]
+        return px, (near[:2] - px * near[2]) / h[:, 2:]
+
+    for _ in range(5):
+        px, by_q = at(coefficients)
+        nearest = np.linalg.norm(px[:, None] - (right_px[:-1] + segments / 2), axis=2).argmin(axis=1)
+        across = ((right_px[nearest] - px) * normal[nearest]).sum(axis=1)
+        rows = design * (by_q * normal[nearest]).sum(axis=1)[:, None]
+        ends = ((right_px[[0, -1]] - px[[0, -1]]) * along[[0, -1]]).sum(axis=1)
+        end_rows = design[[0, -1]] * (by_q[[0, -1]] * along[[0, -1]]).sum(axis=1)[:, None]
+        residual = np.concatenate([across / _ACROSS_PX, ends / _ENDS_PX])
+        matrix = np.concatenate([rows / _ACROSS_PX, end_rows / _ENDS_PX])
+        weight = 1 / (1 + residual**2)
+        normal_matrix = matrix.T @ (weight[:, None] * matrix) + prior
+        coefficients = coefficients + np.linalg.solve(
+            normal_matrix, matrix.T @ (weight * residual) - prior @ coefficients
+        )
+    px, _ = at(coefficients)
+    points_mm = rays / (design @ coefficients)[:, None]
+    nearest = np.linalg.norm(px[:, None] - right_px, axis=2).argmin(axis=1)
+    offset = np.linalg.norm(px - right_px[nearest], axis=1)
+    good = inside(workspace, points_mm) & (offset < 2 * length.max())
+    if good.sum() < 3:
+        return None
+    index = np.flatnonzero(good)
+    crossings = _Crossings(
+        index, nearest[index].astype(np.float64), left_px[index], px[index], points_mm[index], np.ones(len(index))
+    )
+    return _Chain(crossings, float(len(index)) * _LENGTHWISE)
 
 
 def _best_chain(found: _Crossings, rig: StereoRig, parameters: MatchParameters) -> _Chain | None:

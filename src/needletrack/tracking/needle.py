@@ -2,10 +2,11 @@
 
 from typing import Annotated, Literal, Self
 
-from annotated_types import Gt
+from annotated_types import Ge, Gt
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 Positive = Annotated[float, Gt(0)]
+NotNegative = Annotated[float, Ge(0)]
 EntrySide = Literal["none", "left", "right", "top", "bottom"]
 
 
@@ -33,6 +34,9 @@ class Needle(BaseModel):
     max_diameter_mm: Positive = Field(1.2, description="Thickest needle in use, mm.")
     min_length_mm: Positive = Field(8.0, description="Shortest visible length that is called a needle, mm.")
     max_length_mm: Positive = Field(120.0, description="Greatest visible length, mm.")
+    tip_tapers_mm: tuple[NotNegative, ...] = Field(
+        (0.0, 2.5), min_length=1, description="Shapes of tips in use: length of the cone, mm; 0 is a round end."
+    )
 
     @model_validator(mode="after")
     def _ordered(self) -> Self:

@@ -2,7 +2,7 @@
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from needletrack.tracking.axis import AxisParameters
+from needletrack.tracking.beside import BesideParameters
 from needletrack.tracking.centerline import CenterlineParameters
 from needletrack.tracking.ends import EndsParameters
 from needletrack.tracking.fit import FitParameters
@@ -11,6 +11,7 @@ from needletrack.tracking.match import MatchParameters
 from needletrack.tracking.needle import Needle, Workspace
 from needletrack.tracking.refine import RefineParameters
 from needletrack.tracking.segment import SegmentParameters
+from needletrack.tracking.tip import TipParameters
 
 
 class TrackingParameters(BaseModel):
@@ -23,8 +24,9 @@ class TrackingParameters(BaseModel):
     segment: SegmentParameters = Field(SegmentParameters(), description="Thin structures in each image.")
     centerline: CenterlineParameters = Field(CenterlineParameters(), description="Lines traced along them.")
     match: MatchParameters = Field(MatchParameters(), description="Lines of both views paired.")
-    axis: AxisParameters = Field(AxisParameters(), description="The needle's axis to a fraction of a pixel.")
+    beside: BesideParameters = Field(BesideParameters(), description="What lies beside the needle.")
     fit: FitParameters = Field(FitParameters(), description="One curve in space for both views.")
     ends: EndsParameters = Field(EndsParameters(), description="Base and tip.")
+    tip: TipParameters = Field(TipParameters(), description="The tip, to a fraction of a pixel.")
     refine: RefineParameters = Field(RefineParameters(), description="Following the needle from a rough curve.")
     gates: GateParameters = Field(GateParameters(), description="When a shape is ok.")

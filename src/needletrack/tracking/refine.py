@@ -11,32 +11,38 @@ from scipy.ndimage import uniform_filter1d
 
 from needletrack.errors import NeedleNotFound
 from needletrack.geometry.camera import Camera
-from needletrack.geometry.spline import arc_length, basis, resample, unit
+from needletrack.geometry.spline import arc_length, resample, unit
 from needletrack.geometry.stereo import StereoRig
-from needletrack.records import Float, Image, Reason
-from needletrack.tracking.axis import AxisObservations, AxisParameters, observe_axis
+from needletrack.geometry.transform import RigidTransform
+from needletrack.records import Appearance, Float, NeedleTrack, Reason
+from needletrack.tracking.adjust import GROWING, ROUGH, SETTLED, Adjusted, Images, adjust
+from needletrack.tracking.beside import Beside, BesideParameters, look_beside
 from needletrack.tracking.ends import (
     TIP_BEFORE_MM,
     TIP_BEYOND_MM,
     EndsParameters,
     Observed,
     Stretch,
-    TipFit,
     base_end,
-    find_tip,
+    is_crossed,
     needle_stretch,
 )
-from needletrack.tracking.fit import CurveFit, EndObservation, FitParameters, fit_curve
+from needletrack.tracking.fit import CurveFit, EndObservation, Ends, FitParameters
 from needletrack.tracking.needle import Needle, Positive, Workspace
-
-Images = tuple[Image, Image]
+from needletrack.tracking.silhouette import AxisOffsets, diameter_mm
+from needletrack.tracking.tip import BEFORE_MM, BEYOND_MM, ROW_MM, TRIED_MM, TipFit, TipParameters, find_tip
 
 MIN_DEPTH_MM = 20.0
 # How far behind a sleeve's edge the needle is looked for once more, for how long a stretch and how strong a line.
 GOES_ON_FROM_MM, GOES_ON_TO_MM, GOES_ON_MM, GOES_ON_SHARE = 3.0, 16.0, 4.0, 0.6
 # Lens blur and saturation show a needle wider than it is.
 WIDTH_ALLOWANCE = 1.4
-_SILHOUETTE_PERCENTILE = 65
+# No single section has more of a say than these log odds.
+_MOST_ODDS = 30.0
+# The tip is looked for this far beyond where the needle was followed to, in so many rounds.
+_TIP_REACH_MM, _TIP_ROUNDS = 12.0, 4
+# And once more where it was not within this of the end of the curve.
+_TIP_MOVED_MM = 0.3
 
 
 class RefineParameters(BaseModel):
@@ -44,22 +50,20 @@ class RefineParameters(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    spacing_mm: Positive = Field(0.4, description="Spacing of the points of the published centerline, mm.")
-    follow_spacing_mm: Positive = Field(
-        0.8, description="Spacing of the cross sections while the needle is followed, mm."
+    spacing_mm: Positive = Field(1.0, description="Spacing of the points of the published centerline, mm.")
+    reach_mm: Positive = Field(5.0, description="The curve is followed this far beyond its ends in one round, mm.")
+    bend_reach_mm: Positive = Field(
+        2.5, description="And once, where it ends, only this far: it may bend more than was foreseen, mm."
     )
-    reach_mm: Positive = Field(8.0, description="The curve is followed this far beyond its ends in one round, mm.")
-    hold_mm: Positive = Field(
-        1.0,
-        description="On the way, a stretch that a view does not see stays about this near to the prediction, mm.",
-    )
+    gap_reach_mm: Positive = Field(11.0, description="And once, where it ends, this far, across a gap, mm.")
     settled_mm: Positive = Field(2.0, description="A round that lengthens the curve by less than this is the last, mm.")
-    max_rounds: int = Field(
-        15, ge=2, description="Rounds of observing and fitting after a detection, each of which may lengthen the curve."
+    max_rounds: int = Field(15, ge=2, description="Rounds of adjusting, each of which may lengthen the curve.")
+    shown_log_odds: Positive = Field(
+        3.0, description="Log odds of a needle over none from which on a view shows it at a place."
     )
-    max_tracking_rounds: int = Field(
-        6, ge=2, description="Rounds from the track of the pair before; two suffice where the needle moved little."
-    )
+    shown_share: Positive = Field(0.42, description="The curve goes on where so many places of both views show it ...")
+    shown_over_mm: Positive = Field(5.0, description="... over this length, mm.")
+    sleeve_reach_mm: Positive = Field(12.0, description="The sleeve is looked for this far beyond the ends, mm.")
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,9 +72,10 @@ class RefineModels:
 
     needle: Needle
     workspace: Workspace
-    axis: AxisParameters
+    beside: BesideParameters
     fit: FitParameters
     ends: EndsParameters
+    tip: TipParameters
     refine: RefineParameters
 
 
@@ -79,21 +84,27 @@ class Refined:
     """The needle's curve, base -> tip where base_is_known, and what it rests on.
 
     The points of `fit` and of `observed` correspond. tip_px holds the tip as the left and the right view alone place
-    it, raw px (2, 2).
+    it, raw px (2, 2); tip_is_free is false where something crosses there, behind which the needle may go on. log_odds:
+    of such a needle over none, both views together; no single section has more than its say.
     """
 
     fit: CurveFit
-    observed: Observed
+    observed: tuple[AxisOffsets, AxisOffsets]
+    appearance: Appearance
     diameter_mm: float
     base_is_known: bool
     tip: TipFit
+    tip_is_free: bool
     tip_px: Float
+    log_odds: float
 
     @property
     def tip_covariance_mm2(self) -> Float:
-        """Covariance (3, 3) of the tip: across the needle that of the curve, along it that of the signal's end."""
+        """Covariance (3, 3) of the tip: across the needle that of the curve, along it that of the end's picture."""
         along = unit(self.fit.derivative(1)[-1])
-        covariance = self.fit.point_covariance_mm2()[-1] + max(self.tip.sigma_mm) ** 2 * np.outer(along, along)
+        left, right = self.tip.each_mm
+        along_mm = np.hypot(np.sum(np.array(self.tip.sigma_mm) ** -2.0) ** -0.5, abs(left - right) / 2)
+        covariance = self.fit.point_covariance_mm2()[-1] + along_mm**2 * np.outer(along, along)
         return np.asarray((covariance + covariance.T) / 2)
 
 
@@ -103,49 +114,125 @@ def refine(
     points_mm: Float,
     models: RefineModels,
     *,
-    is_track: bool = False,
-    previous_base_mm: Float | None = None,
+    previous: NeedleTrack | None = None,
 ) -> Refined:
     """Follow the needle from a curve (N, 3) in space; raises NeedleNotFound where the views do not show it.
 
-    is_track: the curve is the pair before's, and nearly right; otherwise it is a rough one. previous_base_mm (3,) tells
-    base from tip where no sleeve is seen.
+    previous: the track of the pair before, whose curve this is, which is then nearly right and tells base from tip
+    where no sleeve is seen; without it the curve is a rough one.
     """
-    followed = _follow(images, rig, points_mm, models, is_track)
-    extended, observed, stretch = followed.extended_mm, followed.observed, followed.stretch
+    followed = _follow(images, rig, points_mm, models, previous)
+    spacing = models.refine.spacing_mm
+    margin = round(models.refine.sleeve_reach_mm / spacing)
+    extended = _extended(followed.fit.points_mm, models.refine.sleeve_reach_mm, spacing)
+    seen_diameter_mm = diameter_mm(followed.appearance, models.needle)
+    observed = _look_beside(images, rig, extended, seen_diameter_mm, models)
+    stretch = needle_stretch(observed, margin, len(extended) - margin, spacing, models.ends)
     if stretch.sleeve is not None:
         base: int | None = 0 if stretch.sleeve.index == stretch.start else -1
     else:
         part = extended[stretch.start : stretch.stop]
+        previous_base_mm = None
+        if previous is not None and previous.base is not None and Reason.AMBIGUOUS_BASE not in previous.reasons:
+            previous_base_mm = previous.base.position_mm
         base = base_end(part, rig, models.workspace.entry_side, previous_base_mm)
     if base == -1:
         extended, observed = extended[::-1], (observed[0].turned(), observed[1].turned())
         stretch = Stretch(len(extended) - stretch.stop, len(extended) - stretch.start, stretch.sleeve)
     base_is_known = base is not None and not (
-        stretch.sleeve is not None and _goes_on(images, rig, extended, observed, stretch, followed.diameter_mm, models)
+        stretch.sleeve is not None and _goes_on(images, rig, extended, observed, stretch, seen_diameter_mm, models)
     )
-    arc = arc_length(extended)
-    # What was followed coarsely is looked at closely where the tip is.
-    spacing = models.refine.spacing_mm
-    rough_end_mm = float(arc[stretch.stop - 1])
-    near_mm = (max(0.0, rough_end_mm - TIP_BEFORE_MM), min(float(arc[-1]), rough_end_mm + TIP_BEYOND_MM))
-    end = _cut(extended, *near_mm, spacing)
-    end_observed = _observe(images, rig, end, followed.diameter_mm, models)
-    end_arc = np.linspace(*near_mm, len(end))
-    tip = find_tip(end_observed, end_arc, rough_end_mm, models.axis.smooth_along_mm, models.ends)
-    if tip.at_mm - arc[stretch.start] < models.needle.min_length_mm / 2:
+    adjusted = adjust(
+        images,
+        rig,
+        _even(extended[stretch.start : stretch.stop], spacing),
+        models.needle,
+        models.fit,
+        followed.appearance,
+        looks=SETTLED,
+    )
+    ended = _ended(images, rig, adjusted, models)
+    if abs(ended.tip.at_mm - float(arc_length(adjusted.fit.points_mm)[-1])) > _TIP_MOVED_MM:
+        # Beyond its tip the curve was a guess, and so was what lay about it.
+        ended = _ended(images, rig, ended.final, models)
+    tip, along_mm, final, ends = ended.tip, ended.along_mm, ended.final, ended.ends
+    tip_px = np.stack([_tip_px(view, end[0]) for view, end in zip(final.observed, ends, strict=True)])
+    beyond = _cut(along_mm, max(0.0, tip.at_mm - TIP_BEFORE_MM), tip.at_mm + TIP_BEYOND_MM, spacing)
+    beside = _look_beside(images, rig, beyond, seen_diameter_mm, models)
+    is_free = not is_crossed(beside, min(tip.at_mm, TIP_BEFORE_MM), arc_length(beyond), models.ends)
+    return Refined(
+        final.fit,
+        final.observed,
+        final.appearance,
+        diameter_mm(final.appearance, models.needle) if final.flanks is None else final.flanks.diameter_mm,
+        base_is_known,
+        tip,
+        is_free,
+        tip_px,
+        float(np.clip(final.support, -_MOST_ODDS, _MOST_ODDS).sum()),
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class _Ended:
+    """A tip, the curve (N, 3) on which it was looked for, and the curve that ends there, as both views show it."""
+
+    tip: TipFit
+    along_mm: Float
+    final: Adjusted
+    ends: Ends
+
+
+def _ended(images: Images, rig: StereoRig, adjusted: Adjusted, models: RefineModels) -> _Ended:
+    """The curve brought to an end at the tip itself; raises NeedleNotFound where hardly anything is left of it."""
+    tip, along_mm = _tip(images, rig, adjusted, models)
+    if tip.at_mm < models.needle.min_length_mm / 2:
         raise NeedleNotFound("refine", Reason.TOO_SHORT)
-    # The final curve ends at the tip itself; its last points are held by the taper's edges and the spline's stiffness.
-    visible = _cut(extended, float(arc[stretch.start]), tip.at_mm, spacing)
-    observed = _observe(images, rig, visible, followed.diameter_mm, models)
-    left_end, right_end = (
-        _tip_observation(view, each - tip.at_mm, sigma, spacing)
-        for view, each, sigma in zip(observed, tip.each_mm, tip.sigma_mm, strict=True)
+    visible = _cut(along_mm, 0.0, tip.at_mm, models.refine.spacing_mm)
+    left, right = (
+        (_end_observation(visible, camera, pose, each - tip.at_mm, sigma),)
+        for camera, pose, each, sigma in zip(*_views(rig), tip.each_mm, tip.sigma_mm, strict=True)
     )
-    fit = fit_curve(visible, observed, rig, models.fit, ((left_end,), (right_end,)))
-    tip_px = np.stack([_tip_px(view, end) for view, end in zip(observed, (left_end, right_end), strict=True)])
-    seen_diameter_mm = _diameter_mm(observed, rig, visible)
-    return Refined(fit, observed, seen_diameter_mm or followed.diameter_mm, base_is_known, tip, tip_px)
+    final = adjust(
+        images,
+        rig,
+        visible,
+        models.needle,
+        models.fit,
+        adjusted.appearance,
+        looks=SETTLED,
+        before_tip=(np.linspace(tip.at_mm, 0.0, len(visible)), tip.taper_mm),
+        ends=(left, right),
+    )
+    return _Ended(tip, along_mm, final, (left, right))
+
+
+def _tip(images: Images, rig: StereoRig, adjusted: Adjusted, models: RefineModels) -> tuple[TipFit, Float]:
+    """The tip, and the curve (N, 3) on which it lies, from the base to well beyond it."""
+    curve = adjusted.fit.points_mm
+    spacing = models.refine.spacing_mm
+    along = np.concatenate([curve, _beyond(curve, round(_TIP_REACH_MM / spacing), spacing)])
+    arc = arc_length(along)
+    end_mm, remaining = float(arc[len(curve) - 1]), _TIP_ROUNDS
+    while True:
+        rows_mm = np.arange(max(0.0, end_mm - BEFORE_MM), min(end_mm + BEYOND_MM, arc[-1]), ROW_MM)
+        rows = np.column_stack([np.interp(rows_mm, arc, column) for column in along.T])
+        views = tuple(
+            (image, camera, pose.apply(rows)) for image, camera, pose in zip(images, *_views(rig), strict=True)
+        )
+        tip = find_tip(
+            (views[0], views[1]), rows_mm, end_mm, adjusted.appearance, models.needle, models.tip, adjusted.flanks
+        )
+        # At the border of what was tried it may lie further on.
+        remaining -= 1
+        is_inside = TRIED_MM[0] + 0.2 < tip.at_mm - end_mm < TRIED_MM[1] - 0.2
+        if is_inside or remaining == 0 or not BEFORE_MM < tip.at_mm < arc[-1] - BEYOND_MM:
+            return tip, along
+        end_mm = tip.at_mm
+
+
+def _views(rig: StereoRig) -> tuple[tuple[Camera, Camera], tuple[RigidTransform, RigidTransform]]:
+    return (rig.left, rig.right), (RigidTransform.identity(), rig.right_from_left)
 
 
 def _goes_on(
@@ -161,121 +248,101 @@ def _goes_on(
 
     The base is at the start of the stretch. A sleeve is longer than what is looked at, and its highlights are fainter.
     """
-    spacing = models.refine.follow_spacing_mm
+    spacing = models.refine.spacing_mm
     outwards = extended_mm[stretch.start : stretch.stop][::-1]
     skipped, count = (round(mm / spacing) for mm in (GOES_ON_FROM_MM, GOES_ON_TO_MM))
-    behind = _observe(images, rig, _beyond(outwards, count, spacing)[skipped:], diameter_mm, models)
+    behind = _look_beside(images, rig, _beyond(outwards, count, spacing)[skipped:], diameter_mm, models)
     shares = [
-        view.signals_gray_px[1] / max(float(np.median(seen.signals_gray_px[1, stretch.start : stretch.stop])), 1e-6)
+        view.line_gray_px / max(float(np.median(seen.line_gray_px[stretch.start : stretch.stop])), 1e-6)
         for view, seen in zip(behind, observed, strict=True)
     ]
     shown = np.min(shares, axis=0) > GOES_ON_SHARE
     return bool(uniform_filter1d(shown.astype(np.float64), round(GOES_ON_MM / spacing), mode="constant").max() > 0.999)
 
 
-def _tip_observation(view: AxisObservations, ahead_mm: float, sigma_mm: float, spacing_mm: float) -> EndObservation:
-    px_per_mm = float(np.linalg.norm(view.center_px[-1] - view.center_px[-2])) / spacing_mm
-    return EndObservation(len(view.center_px) - 1, ahead_mm * px_per_mm, max(0.5, sigma_mm * px_per_mm))
+def _end_observation(
+    points_mm: Float, camera: Camera, pose: RigidTransform, ahead_mm: float, sigma_mm: float
+) -> EndObservation:
+    last_px = camera.project(pose.apply(points_mm[-2:]))
+    spacing_mm = float(np.linalg.norm(points_mm[-1] - points_mm[-2]))
+    px_per_mm = float(np.linalg.norm(last_px[1] - last_px[0])) / spacing_mm
+    return EndObservation(len(points_mm) - 1, ahead_mm * px_per_mm, max(0.5, sigma_mm * px_per_mm))
 
 
-def _tip_px(view: AxisObservations, end: EndObservation) -> Float:
+def _tip_px(view: AxisOffsets, end: EndObservation) -> Float:
     normal = view.normal[-1]
     along = np.array([normal[1], -normal[0]])
     return np.asarray(view.center_px[-1] + view.offset_px[-1] * normal + end.shift_px * along)
 
 
-@dataclass(frozen=True, slots=True)
-class _Followed:
-    """A curve that runs on past both ends of the needle, what the views show across it, and the needle's part of it."""
-
-    extended_mm: Float
-    observed: Observed
-    stretch: Stretch
-    diameter_mm: float
-
-
-def _follow(images: Images, rig: StereoRig, points_mm: Float, models: RefineModels, is_track: bool) -> _Followed:
-    """Observe, and fit and lengthen, until the needle's part grows no more.
-
-    A detected curve needs two fits to settle. The track of the pair before needs one, and is done with as soon as it
-    has its length again: where the needle has moved sideways, its far end comes into reach round by round.
-    """
-    max_rounds = models.refine.max_tracking_rounds if is_track else models.refine.max_rounds
-    min_rounds = 2 if is_track else 3
-    needed_mm = float(arc_length(points_mm)[-1]) if is_track else np.inf
-    spacing = models.refine.follow_spacing_mm
-    points, longest_mm = points_mm, 0.0
-    diameter_mm: float | None = None
-    for remaining in reversed(range(max_rounds)):
-        extended, observed = _observe_extended(images, rig, points, diameter_mm, models)
-        stretch = needle_stretch(observed, spacing, models.ends)
-        start, stop = stretch.start, stretch.stop
-        part = (observed[0].part(start, stop), observed[1].part(start, stop))
-        diameter_mm = _diameter_mm(part, rig, extended[start:stop])
-        length_mm = (stop - start) * spacing
-        if diameter_mm is None or length_mm < models.needle.min_length_mm / 2:
+def _follow(
+    images: Images, rig: StereoRig, points_mm: Float, models: RefineModels, previous: NeedleTrack | None
+) -> Adjusted:
+    """The curve adjusted, cut to what the views show, lengthened and adjusted again until it grows no more."""
+    spacing = models.refine.spacing_mm
+    appearance = None if previous is None else previous.appearance
+    points = _even(points_mm, spacing)
+    length_mm = 0.0
+    reaches: tuple[float, ...] = (models.refine.reach_mm, models.refine.bend_reach_mm, models.refine.gap_reach_mm)
+    # A needle that is followed has been looked for behind bends and gaps before.
+    reaches = reaches if previous is None else reaches[:1]
+    remaining, reach, looks = models.refine.max_rounds, 0, ROUGH
+    while True:
+        remaining -= 1
+        adjusted = adjust(images, rig, points, models.needle, models.fit, appearance, looks=looks)
+        appearance, looks = adjusted.appearance, GROWING
+        shown = _shown(adjusted, models)
+        if shown is None:
             raise NeedleNotFound("refine", Reason.LOW_COVERAGE)
-        if length_mm > 2 * models.needle.max_length_mm:
+        part = adjusted.part(*shown)
+        grown_mm = (shown[1] - shown[0] - 1) * spacing - length_mm
+        length_mm += grown_mm
+        if length_mm > 1.5 * models.needle.max_length_mm:
             raise NeedleNotFound("refine", Reason.TOO_LONG)
-        grows = length_mm > longest_mm + models.refine.settled_mm
-        is_whole = length_mm > needed_mm - models.refine.settled_mm
-        if remaining == 0 or (max_rounds - remaining >= min_rounds and (is_whole or not grows)):
-            return _Followed(extended, observed, stretch, diameter_mm)
-        longest_mm = max(longest_mm, length_mm)
-        fit = fit_curve(extended[start:stop], part, rig, models.fit, hold_mm=models.refine.hold_mm)
-        points = _sampled(fit, spacing)
-        if arc_length(points)[-1] < models.needle.min_length_mm / 2:
-            raise NeedleNotFound("refine", Reason.TOO_SHORT)
-    raise ValueError("max_rounds must be one or more")
+        # What grows no more may bend more than was foreseen, or go on behind a gap.
+        reach = 0 if grown_mm > min(models.refine.settled_mm, reaches[reach] / 2) else reach + 1
+        if remaining == 0 or reach == len(reaches):
+            break
+        points = _extended(part.fit.points_mm, reaches[reach], spacing)
+    if length_mm < models.needle.min_length_mm / 2:
+        raise NeedleNotFound("refine", Reason.TOO_SHORT)
+    return part
 
 
-def _observe_extended(
-    images: Images, rig: StereoRig, points_mm: Float, diameter_mm: float | None, models: RefineModels
-) -> tuple[Float, Observed]:
-    extended = _extended(points_mm, models.refine.reach_mm, models.refine.follow_spacing_mm)
-    return extended, _observe(images, rig, extended, diameter_mm, models)
+def _shown(adjusted: Adjusted, models: RefineModels) -> tuple[int, int] | None:
+    """The longest stretch start <= i < stop of which the views show a needle, gaps bridged; None: they show none."""
+    spacing = models.refine.spacing_mm
+    shown = (adjusted.support > models.refine.shown_log_odds).mean(axis=0)
+    window = max(3, round(models.refine.shown_over_mm / spacing))
+    present = (shown > 0) & (uniform_filter1d(shown, window, mode="nearest") > models.refine.shown_share)
+    index = np.flatnonzero(present)
+    if len(index) == 0:
+        return None
+    cuts = np.flatnonzero(np.diff(index) > models.ends.max_gap_mm / spacing)
+    starts, stops = np.concatenate([[0], cuts + 1]), np.concatenate([cuts, [len(index) - 1]])
+    best = int(np.argmax([shown[index[a] : index[b] + 1].sum() for a, b in zip(starts, stops, strict=True)]))
+    return int(index[starts[best]]), int(index[stops[best]]) + 1
 
 
-def _observe(
-    images: Images, rig: StereoRig, points_mm: Float, diameter_mm: float | None, models: RefineModels
-) -> Observed:
-    return (
-        _observe_one(images[0], rig.left, points_mm, diameter_mm, models),
-        _observe_one(images[1], rig.right, rig.right_from_left.apply(points_mm), diameter_mm, models),
-    )
-
-
-def _observe_one(
-    image: Image, camera: Camera, local_mm: Float, diameter_mm: float | None, models: RefineModels
-) -> AxisObservations:
-    if local_mm[:, 2].min() < MIN_DEPTH_MM:
+def _look_beside(
+    images: Images, rig: StereoRig, points_mm: Float, diameter_mm: float, models: RefineModels
+) -> tuple[Beside, Beside]:
+    right_mm = rig.right_from_left.apply(points_mm)
+    if min(points_mm[:, 2].min(), right_mm[:, 2].min()) < MIN_DEPTH_MM:
         raise NeedleNotFound("refine", Reason.OUTSIDE_WORKSPACE)
-    px_per_mm = camera.focal_px / local_mm[:, 2]
-    max_width_px = float(models.needle.max_diameter_mm * px_per_mm.max()) * WIDTH_ALLOWANCE
-    # A diameter out of range is told by the gates; expecting it here would follow ever wider things.
-    expected = (
-        None if diameter_mm is None else min(diameter_mm, models.needle.max_diameter_mm * WIDTH_ALLOWANCE) * px_per_mm
+    return (
+        look_beside(images[0], rig.left, points_mm, diameter_mm, models.beside),
+        look_beside(images[1], rig.right, right_mm, diameter_mm, models.beside),
     )
-    return observe_axis(image, camera, local_mm, max_width_px, expected, models.axis)
 
 
-def _diameter_mm(observed: Observed, rig: StereoRig, points_mm: Float) -> float | None:
-    depth = (points_mm[:, 2], rig.right_from_left.apply(points_mm)[:, 2])
-    focal = (rig.left.focal_px, rig.right.focal_px)
-    widths = np.concatenate([view.width_px * z / f for view, z, f in zip(observed, depth, focal, strict=True)])
-    # Streaks show less than the needle's width, clutter more: an upper quartile is the silhouette's.
-    return float(np.nanpercentile(widths, _SILHOUETTE_PERCENTILE)) if np.isfinite(widths).any() else None
-
-
-def _sampled(fit: CurveFit, spacing_mm: float) -> Float:
-    dense = basis(np.linspace(0, 1, 4 * len(fit.points_mm)), len(fit.control_mm)) @ fit.control_mm
-    return resample(dense, max(8, round(float(arc_length(dense)[-1]) / spacing_mm) + 1))
+def _even(points_mm: Float, spacing_mm: float) -> Float:
+    return resample(points_mm, max(8, round(float(arc_length(points_mm)[-1]) / spacing_mm) + 1))
 
 
 def _extended(points_mm: Float, reach_mm: float, spacing_mm: float) -> Float:
     """The curve, evenly spaced, and beyond both ends as a parabola whose bend is that of the last stretch."""
-    count = max(8, round(float(arc_length(points_mm)[-1]) / spacing_mm) + 1)
-    even = resample(points_mm, count)
+    even = _even(points_mm, spacing_mm)
     n = round(reach_mm / spacing_mm)
     return np.concatenate([_beyond(even[::-1], n, spacing_mm)[::-1], even, _beyond(even, n, spacing_mm)])
 
@@ -287,8 +354,7 @@ def _beyond(points_mm: Float, count: int, spacing_mm: float) -> Float:
     slope, bend = np.linalg.lstsq(design, stretch - stretch[-1], rcond=None)[0]
     ahead = np.arange(1, count + 1) * spacing_mm
     direction = unit(slope)
-    # An extrapolated bend is a guess: half of it is right for an arc and harmless for a straight end.
-    return np.asarray(stretch[-1] + ahead[:, None] * direction + 0.5 * (ahead**2)[:, None] * bend)
+    return np.asarray(stretch[-1] + ahead[:, None] * direction + (ahead**2)[:, None] * bend)
 
 
 def _cut(points_mm: Float, start_mm: float, stop_mm: float, spacing_mm: float) -> Float:

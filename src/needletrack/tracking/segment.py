@@ -5,6 +5,7 @@ diameters implies in the workspace, for bright and dark lines apart: a needle ma
 bright needle must not swallow it.
 """
 
+import math
 from dataclasses import dataclass
 
 import cv2
@@ -19,6 +20,8 @@ Mask = npt.NDArray[np.bool_]
 Gray = npt.NDArray[np.float32]
 # Reduced images keep the thinnest needle about this wide, px: thinner ones drown in noise, wider ones only cost time.
 _REDUCED_WIDTH_PX = 0.9
+# The side lobes of a line, in sigmas of the filter.
+_LOBE_REACH = 2.5
 
 
 # Lines cover a few percent of an image; noise makes about a third of its pixels respond.
@@ -60,7 +63,6 @@ def find_ridges(image: Image, width_range_px: tuple[float, float], parameters: S
     reduced = cv2.resize(trimmed, size, interpolation=cv2.INTER_AREA).astype(np.float32)
     widths = np.array(width_range_px) / reduction
     bright, dark = _line_responses(reduced, (max(1.0, widths[0] / 2), max(2.0, widths[1] / 2)))
-    bright, dark = _without_side_lobes(bright, dark)
     return Ridges(_hysteresis(bright, parameters), _hysteresis(dark, parameters), reduced, reduction)
 
 
@@ -80,17 +82,21 @@ def _line_responses(image: Gray, sigmas_px: tuple[float, ...]) -> tuple[Gray, Gr
         size = np.abs(mean)
         strength = size + spread
         strength *= (3 * size > spread) & (size < 3 * spread)
-        np.maximum(bright, strength * (mean < 0), out=bright)
-        np.maximum(dark, strength * (mean > 0), out=dark)
+        sides = [np.where(side, strength, np.float32(0)) for side in (mean < 0, mean > 0)]
+        lines = _without_side_lobes(sides[0], sides[1], sigma)
+        np.maximum(bright, lines[0], out=bright)
+        np.maximum(dark, lines[1], out=dark)
     for response in (bright, dark):
         response[[0, -1]] = 0
         response[:, [0, -1]] = 0
     return bright, dark
 
 
-def _without_side_lobes(bright: Gray, dark: Gray) -> tuple[Gray, Gray]:
-    # Beside a line of one polarity the second derivative has lobes of the other, 0.45 of its height (Gaussian profile).
-    reach = np.ones((9, 9), np.uint8)
+def _without_side_lobes(bright: Gray, dark: Gray, sigma: float) -> tuple[Gray, Gray]:
+    # Beside a line of one polarity the second derivative has lobes of the other, 0.45 of its height (Gaussian profile),
+    # as far as the filter reaches: what is further away, such as a vessel beside a faint needle, has none here.
+    size = 2 * math.ceil(_LOBE_REACH * sigma) + 1
+    reach = np.ones((size, size), np.uint8)
     share = np.float32(0.6)
     return bright * (bright > share * cv2.dilate(dark, reach)), dark * (dark > share * cv2.dilate(bright, reach))
 

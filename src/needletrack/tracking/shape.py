@@ -1,5 +1,6 @@
 """A refined curve with its verdict, and the track that is published of it."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -25,18 +26,30 @@ from needletrack.tracking.parameters import TrackingParameters
 from needletrack.tracking.refine import Refined
 
 _SAME_SHAPE_MM = 2.0
+# The tip's direction is taken over this much of the needle, mm before the apex.
+_DIRECTION_MM, _DIRECTION_SKIP_MM, _LEAST_DIRECTION_MM, _PARABOLA_RAD = 19.0, 3.0, 6.0, 0.5
 _MAX_VELOCITY_INTERVAL_NS = 250_000_000
 
 
 @dataclass(frozen=True, slots=True)
 class Shape:
-    """A shape and why it is not ok (empty where it is); support_mm is the length that the views show, both added."""
+    """A shape and why it is not ok (empty where it is); support_mm is the length that the views show, both added.
+
+    doubts: those of the reasons that only a search of the whole images can find, or lift.
+    """
 
     refined: Refined
     curve: NeedleCurve
     quality: Quality
     support_mm: float
     reasons: tuple[Reason, ...]
+    doubts: tuple[Reason, ...] = ()
+
+    def doubted(self, doubts: Iterable[Reason]) -> "Shape":
+        """The same shape with reasons that only a search of the whole images can find, or lift."""
+        both = {*self.doubts, *doubts}
+        reasons = tuple(reason for reason in Reason if reason in both or reason in self.reasons)
+        return replace(self, reasons=reasons, doubts=tuple(reason for reason in Reason if reason in both))
 
 
 def judged(refined: Refined, rig: StereoRig, parameters: TrackingParameters, previous: NeedleTrack | None) -> Shape:
@@ -57,7 +70,7 @@ def judged(refined: Refined, rig: StereoRig, parameters: TrackingParameters, pre
         float(sampson_distance_px(rig.fundamental, left_px, right_px)[0]),
         float(seen.all(axis=0).mean()),
     )
-    support_mm = float(sum(view.firm.mean() for view in refined.observed)) * curve.length_mm
+    support_mm = float(sum(view.seen.mean() for view in refined.observed)) * curve.length_mm
     reasons = weaknesses(
         refined, curve, quality, rig, parameters.needle, parameters.workspace, parameters.gates, previous
     )
@@ -80,7 +93,7 @@ def as_track(
 ) -> NeedleTrack:
     """The track to publish: without a tip where the free end was not found, for a curve's end is not yet a tip."""
     fit, points_mm = shape.refined.fit, shape.curve.points_mm
-    along = unit(fit.derivative(1)[[0, -1]])
+    along = np.stack([unit(fit.derivative(1)[0]), _tip_direction(points_mm)])
     tip = None
     if Reason.TIP_NOT_SEEN not in shape.reasons:
         tip = TipPose(
@@ -99,11 +112,31 @@ def as_track(
         tip,
         BasePose(points_mm[0], along[0]),
         shape.refined.diameter_mm,
+        shape.refined.appearance,
         since_detection,
         shape.quality,
         elapsed_ms,
         replace(evidence, axis_residual_px=fit.residual_px),
+        shape.doubts,
     )
+
+
+def _tip_direction(points_mm: Float) -> Float:
+    """Unit direction (3,) out of the tip: of a parabola through the last stretch, the tip's own taper left out.
+
+    What shows there is thin and faint: the spline's own end is twice as far off.
+    """
+    arc = arc_length(points_mm)
+    before = arc - arc[-1]
+    # A parabola follows a needle's turn over about half a radian.
+    turn = curvature(np.gradient(points_mm, arc, axis=0), np.gradient(np.gradient(points_mm, arc, axis=0), arc, axis=0))
+    bend = float(np.median(turn[before >= -_DIRECTION_MM]))
+    length_mm = min(_DIRECTION_MM - _DIRECTION_SKIP_MM, max(_LEAST_DIRECTION_MM, _PARABOLA_RAD / max(bend, 1e-6)))
+    last = (before >= -_DIRECTION_SKIP_MM - length_mm) & (before <= -_DIRECTION_SKIP_MM)
+    if last.sum() < 5:
+        return unit(points_mm[-1] - points_mm[-2])
+    design = np.vander(before[last], 3, increasing=True)
+    return unit(np.linalg.lstsq(design, points_mm[last], rcond=None)[0][1])
 
 
 def _sigma_across_mm(fit: CurveFit) -> Float:

@@ -4,25 +4,30 @@ detect (segment -> centerline -> match, triangulating) -> refine (axis, fit, end
 detection is skipped as long as refinement from where the needle was holds.
 """
 
-from dataclasses import replace
+import numpy as np
 
 from needletrack.errors import NeedleNotFound
+from needletrack.geometry.spline import distance_from_curve, unit
 from needletrack.geometry.stereo import StereoRig
 from needletrack.records import Evidence, Frame, Image, NeedleTrack, Reason, Status, StereoPair
+from needletrack.tracking.adjust import Images
 from needletrack.tracking.detect import detect
 from needletrack.tracking.fit import initial_curve
 from needletrack.tracking.match import Candidate
 from needletrack.tracking.parameters import TrackingParameters
-from needletrack.tracking.refine import Images, RefineModels, refine
+from needletrack.tracking.refine import RefineModels, refine
 from needletrack.tracking.shape import Shape, as_track, differ, judged
 from needletrack.tracking.stopwatch import Stopwatch
 
 # Candidates this close to the best one in score are examined as well: two that hold make the shape ambiguous.
 _RIVAL_SHARE = 0.4
 # A weak track is searched for anew once in so many pairs, sooner where its shape is in doubt; one that holds is not.
-_PAIRS_PER_SEARCH = 30
-_PAIRS_PER_SEARCH_IN_DOUBT = 10
-_IN_DOUBT = {Reason.AMBIGUOUS_BASE, Reason.LOW_COVERAGE, Reason.HIGH_RESIDUAL}
+_PAIRS_PER_SEARCH = 15
+_PAIRS_PER_SEARCH_IN_DOUBT = 5
+# What is detected so near to a tip, not behind it, and so long may be more of the needle: the far side of a hook.
+_GOES_ON_WITHIN_MM, _GOES_ON_COSINE, _GOES_ON_MM = 40.0, -0.3, 4.0
+_APART_PX = 8.0
+_IN_DOUBT = {Reason.AMBIGUOUS_BASE, Reason.LOW_COVERAGE, Reason.HIGH_RESIDUAL, Reason.HIGH_UNCERTAINTY}
 
 
 def track(
@@ -75,16 +80,15 @@ def _followed(
     """The needle refined from where it was, or None where that does not hold or a search is due."""
     if previous is None or previous.curve is None:
         return None
-    base_mm = None if previous.base is None else previous.base.position_mm
     try:
         with stopwatch("refine"):
             points_mm = previous.curve.points_mm
-            refined = refine(images, rig, points_mm, _models(parameters), is_track=True, previous_base_mm=base_mm)
-            shape = judged(refined, rig, parameters, previous)
+            refined = refine(images, rig, points_mm, _models(parameters), previous=previous)
+            shape = judged(refined, rig, parameters, previous).doubted(previous.doubts)
     except NeedleNotFound:
         # Lost is not yet gone: the search that follows decides, and its reason is the one that is told.
         return None
-    allowed = _PAIRS_PER_SEARCH_IN_DOUBT if _IN_DOUBT & set(shape.reasons) else _PAIRS_PER_SEARCH
+    allowed = _PAIRS_PER_SEARCH_IN_DOUBT if _IN_DOUBT & set(shape.reasons) or shape.doubts else _PAIRS_PER_SEARCH
     return shape if not shape.reasons or previous.since_detection + 1 < allowed else None
 
 
@@ -114,18 +118,48 @@ def _searched(
             lost.append(error)
     if not found:
         raise lost[0]
-    best, candidate = min(found, key=lambda each: (bool(each[0].reasons), -each[0].support_mm))
+    # What begins at a sleeve is a needle rather than what is longer: vessels and rods are long.
+    best, candidate = min(
+        found,
+        key=lambda each: (
+            bool(each[0].reasons),
+            Reason.AMBIGUOUS_BASE in each[0].reasons,
+            -each[0].refined.log_odds * each[1].plausible,
+        ),
+    )
     if not best.reasons and any(not shape.reasons and differ(shape, best) for shape, _ in found):
-        best = replace(best, reasons=(Reason.AMBIGUOUS_SHAPE,))
+        best = best.doubted([Reason.AMBIGUOUS_SHAPE])
+    if _may_go_on(best, candidates, rig):
+        best = best.doubted([Reason.TIP_NOT_SEEN])
     return best, candidate
+
+
+def _may_go_on(shape: Shape, candidates: list[Candidate], rig: StereoRig) -> bool:
+    """Whether something was detected ahead of the tip that may be more of the needle, behind a stretch without."""
+    points = shape.curve.points_mm
+    ahead = unit(points[-1] - points[-4])
+    for candidate in candidates:
+        # What lies on the needle in one view is a ghost of it: its rim in one view paired with its streak in the other.
+        apart = [
+            distance_from_curve(other, own)
+            for other, own in zip(rig.project(candidate.points_mm), rig.project(points), strict=True)
+        ]
+        other = candidate.points_mm[np.min(apart, axis=0) > _APART_PX]
+        gap = other - points[-1]
+        near = np.linalg.norm(gap, axis=1) < _GOES_ON_WITHIN_MM
+        near &= (unit(gap) @ ahead) > _GOES_ON_COSINE
+        if near.any() and np.linalg.norm(np.ptp(other[near], axis=0)) > _GOES_ON_MM:
+            return True
+    return False
 
 
 def _models(parameters: TrackingParameters) -> RefineModels:
     return RefineModels(
         parameters.needle,
         parameters.workspace,
-        parameters.axis,
+        parameters.beside,
         parameters.fit,
         parameters.ends,
+        parameters.tip,
         parameters.refine,
     )

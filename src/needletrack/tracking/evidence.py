@@ -1,0 +1,195 @@
+"""How likely a needle's silhouette of known width lies at each place across it, whatever its inside looks like.
+
+A cross section of the straightened image is modelled as a Gaussian process: on either side of two edges a background
+that wanders slowly, between them an inside that may hold anything (shading, streaks of light, a dark rim), all blurred
+by the lens. Integrating over what inside and background are leaves the evidence of where the edges are (Gaussian
+process marginal likelihood, Rasmussen & Williams 2006, eq. 2.30): a streak cannot pull the axis, an edge without
+contrast leaves it to the other one, and a section without either says so by a flat curve.
+"""
+
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
+
+import numpy as np
+import numpy.typing as npt
+from scipy.interpolate import CubicSpline
+from scipy.special import ndtr
+
+from needletrack.records import Appearance, Float
+
+Float32 = npt.NDArray[np.float32]
+
+# Everything here is in units of which the rig's owner's thickest needle has six across: the same matrices then serve
+# every rig and depth. Sections reach this far to either side of the predicted axis, at this spacing.
+REACH, ACROSS_STEP = 8.0, 0.5
+UNITS_PER_MAX_DIAMETER = 6.0
+OFFSETS = np.arange(-REACH, REACH + ACROSS_STEP / 2, ACROSS_STEP)
+
+
+@dataclass(frozen=True, eq=False)
+class Grid:
+    """The shifts at which the axis is looked for: `substeps` of them to each sample, to either side up to `reach`.
+
+    One covariance serves every shift by whole samples. refine (F, S) interpolates from shifts to
+    fine_shifts.
+    """
+
+    substeps: int
+    reach: int
+
+    @cached_property
+    def shifts(self) -> Float:
+        """All shifts (S,), evenly spaced."""
+        return np.arange(-self.reach, self.reach + 1, dtype=np.float64) * (ACROSS_STEP / self.substeps)
+
+    @cached_property
+    def fine_shifts(self) -> Float:
+        """Four (F,) to each of them."""
+        return np.linspace(self.shifts[0], self.shifts[-1], 4 * (len(self.shifts) - 1) + 1)
+
+    @cached_property
+    def refine(self) -> Float:
+        """Cubic interpolation (F, S)."""
+        return np.asarray(CubicSpline(self.shifts, np.eye(len(self.shifts)))(self.fine_shifts))
+
+
+# Where the axis is nearly known, and where it is not.
+NEAR, WIDE, _HERE = Grid(4, 12), Grid(2, 14), Grid(1, 0)
+# Sigmas of the lens blur, and half widths (a step of 4 %), for which there are matrices.
+BLURS = (0.45, 0.55, 0.68, 0.84, 1.05, 1.3)
+HALF_WIDTHS = 1.2 * 1.04 ** np.arange(0, 34)
+
+# Standard deviations, in units of a section's noise: of the common level, of a side against it, how much a background
+# wanders per root unit (one that is even, one with clutter), and how much the inside wanders and how large it is
+# (shaded, streaks, anything).
+_LEVEL, _SIDE = 200.0, 20.0
+_BACKGROUND_WANDER = (2.0, 12.0)
+INSIDES = ((20.0, 60.0), (150.0, 100.0))
+DULL, LIVELY = 0, 1
+# Two sides that meet, with next to nothing in between, are one edge.
+_EDGE_HALF_WIDTH = 1e-3
+_LATENT_STEP = 0.25
+_LATENT_REACH = REACH + 8.0
+_OUTWARDS = np.arange(0.0, _LATENT_REACH - _LATENT_STEP, _LATENT_STEP)
+
+
+def products(sections: Float) -> Float32:
+    """The products (N, F) of every two samples of sections (N, len(OFFSETS)), and 1: what evidence is computed from.
+
+    A misfit is a quadratic form in a section: as one row of a matrix product it costs half of what whitening does, and
+    leaves nothing to square and sum. Samples are first whitened as if there were background alone: what misfits have in
+    common, which is a thousand times what tells them apart, would else leave single precision nothing.
+    """
+    centered = sections - np.median(sections, axis=1, keepdims=True)
+    white = (_reference() @ centered.T).astype(np.float32)
+    first, second = _PAIRS
+    return np.concatenate([white[first] * white[second], np.ones((1, len(sections)), np.float32)]).T
+
+
+def log_evidence(shown: Float32, appearance: Appearance, grid: Grid) -> Float:
+    """Log evidence (N, S) of the axis at each shift of the grid, for the `products` of sections of unit noise."""
+    bank = _bank(float(HALF_WIDTHS[appearance.half_width]), BLURS[appearance.blur], appearance.inside, grid)
+    return _evidence(shown, bank).astype(np.float64)
+
+
+def log_evidence_of_no_needle(shown: Float32, blur: int) -> Float:
+    """Log evidence (N,) of background alone, or of one edge between two, for the `products` of sections of unit noise.
+
+    The edge is that of something wide: of a sleeve, a rod, a vessel beside the curve. It may be anywhere.
+    """
+    nothing = _evidence(shown, _bank(0.0, BLURS[blur], 0, _HERE))[:, 0]
+    edge = _evidence(shown, _edge_bank(BLURS[blur]))
+    likeliest = edge.max(axis=1)
+    anywhere = likeliest + np.log(np.exp(edge - likeliest[:, None]).mean(axis=1))
+    return np.asarray(np.logaddexp(nothing, anywhere), dtype=np.float64)
+
+
+def _evidence(shown: Float32, bank: Float32) -> Float32:
+    one, other = np.split(shown @ bank, len(_BACKGROUND_WANDER), axis=1)
+    # np.logaddexp takes three times as long.
+    return np.asarray(np.maximum(one, other) + np.log1p(np.exp(-np.abs(one - other))))
+
+
+_PAIRS = np.triu_indices(len(OFFSETS))
+
+
+@lru_cache(maxsize=1)
+def _reference() -> Float:
+    """The symmetric matrix that whitens background that wanders least; it treats left and right alike."""
+    covariance = _covariances(OFFSETS[None], 0.0, BLURS[0], 0)[0, 0] + np.eye(len(OFFSETS))
+    values, vectors = np.linalg.eigh((covariance + covariance[::-1, ::-1]) / 2)
+    return np.asarray((vectors / np.sqrt(values)) @ vectors.T)
+
+
+@lru_cache(maxsize=1024)
+def _bank(half_width: float, blur: float, inside: int, grid: Grid) -> Float32:
+    """The hypotheses of one half width at every shift of the grid; of 0: of background alone, without shifts.
+
+    They are the weights (F, kinds * shifts) of `products` in their log evidence.
+    """
+    extra = grid.reach // grid.substeps + 1
+    n = len(OFFSETS)
+    longer = np.arange(-extra, n) * ACROSS_STEP - REACH
+    rests = np.arange(grid.substeps)[:, None] * (ACROSS_STEP / grid.substeps)
+    seen = _covariances(longer - rests, half_width, blur, inside)
+    wholes, rest = np.divmod(np.arange(grid.reach + 1), grid.substeps)
+    index = extra - wholes[:, None] + np.arange(n)
+    forms, log_determinants = _forms(
+        seen[rest[:, None, None], :, index[:, :, None], index[:, None]].transpose(0, 3, 1, 2)
+    )
+    # Shifts the other way are the mirror images.
+    return _as_bank(
+        np.concatenate([forms[:0:-1, :, ::-1, ::-1], forms]),
+        np.concatenate([log_determinants[:0:-1], log_determinants]),
+    )
+
+
+@lru_cache(maxsize=64)
+def _edge_bank(blur: float) -> Float32:
+    """A single edge at every sample but the outermost ones."""
+    return _as_bank(*_forms(_covariances(OFFSETS - OFFSETS[2:-2, None], _EDGE_HALF_WIDTH, blur, 0)))
+
+
+def _as_bank(forms: Float, log_determinants: Float) -> Float32:
+    first, second = _PAIRS
+    weights = forms[..., first, second] * np.where(first == second, -0.5, -1.0)
+    both = np.concatenate([weights, -log_determinants[..., None]], axis=2).swapaxes(0, 1)
+    return np.ascontiguousarray(both.reshape(-1, len(first) + 1).T, dtype=np.float32)
+
+
+def _forms(covariances: Float) -> tuple[Float, Float]:
+    """Quadratic forms (shifts, kinds, n, n) of misfits in sections whitened by `_reference`; log determinants.
+
+    covariances (shifts, kinds, n, n): of what is seen but for the noise.
+    """
+    whitener = _reference()
+    white = whitener @ (covariances + np.eye(covariances.shape[-1])) @ whitener
+    log_determinants = np.log(np.diagonal(np.linalg.cholesky(white), axis1=2, axis2=3)).sum(axis=2)
+    log_determinants -= np.linalg.slogdet(whitener)[1]
+    return np.asarray(np.linalg.inv(white), dtype=np.float64), log_determinants
+
+
+def _covariances(samples: Float, half_width: float, blur: float, inside: int) -> Float:
+    """Covariances (P, kinds, n, n) of what n samples at each of the places (P, n) from the axis see through the lens.
+
+    One kind for each wander of the background, which is a random walk: the sum of steps at places a bin apart, each of
+    which is seen as the blur's integral.
+    """
+    wander = np.array(_BACKGROUND_WANDER)[:, None, None] ** 2
+    if half_width == 0:
+        steps = ndtr((samples[..., None] - np.arange(0.5 - _LATENT_REACH, _LATENT_REACH, _LATENT_STEP)) / blur)
+        return np.asarray(_LEVEL**2 + wander * (_LATENT_STEP * _gram(steps))[:, None])
+    steps = ndtr((np.stack([samples, -samples])[..., None] - half_width - _OUTWARDS) / blur)
+    sides = _gram(steps[..., :1]).sum(axis=0)
+    walks = _LATENT_STEP * (_gram(steps[..., 1:]).sum(axis=0) + sides / 2)
+    borders = np.linspace(-half_width, half_width, max(2, round(2 * half_width / _LATENT_STEP)) + 1)
+    bins = -np.diff(ndtr((samples[..., None] - borders) / blur), axis=-1)
+    between = borders[:-1]
+    inside_wander, size = INSIDES[inside]
+    decay = np.exp(-np.abs(between[:, None] - between) * inside_wander**2 / (2 * size**2))
+    common = _LEVEL**2 + _SIDE**2 * sides + size**2 * bins @ decay @ bins.swapaxes(-1, -2)
+    return np.asarray(common[:, None] + wander * walks[:, None])
+
+
+def _gram(rows: Float) -> Float:
+    return rows @ rows.swapaxes(-1, -2)

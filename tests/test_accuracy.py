@@ -1,6 +1,7 @@
-"""Tracks of the bundled recordings against their exact truth; and the score against tracks whose errors are known."""
+"""Tracks of the bundled recordings against their exact truth."""
 
-from dataclasses import replace
+from collections.abc import Iterable
+from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from threading import Event
@@ -8,11 +9,10 @@ from threading import Event
 import numpy as np
 import pytest
 
-from needletrack.geometry.transform import orientation_along
 from needletrack.recording.asl import AslRecording
 from needletrack.recording.replay import ReplaySource
-from needletrack.records import BasePose, Float, NeedleCurve, NeedleTrack, Reason, Status, TipPose
-from needletrack.scoring import Score, Summary, TrueShape, recorded_truth, score
+from needletrack.records import NeedleTrack, Status
+from needletrack.scoring import Score, Summary, recorded_truth, score
 from needletrack.tracking.track import track_pair
 
 RECORDINGS = Path(__file__).parent / "data" / "recordings"
@@ -45,24 +45,79 @@ def stamps(name: str) -> set[int]:
     return set(recorded_truth(RECORDINGS / name))
 
 
-# What this project owes on the setting of the 2017 paper: a dark needle on white, a white one on dark.
+@dataclass(frozen=True)
+class Bounds:
+    """What a recording's tracks must keep to, mm: 1.3 to 1.5 times what they do.
+
+    least_ok: tracks called ok. rms_mm: median of the curves of ok tracks; worst_mm: the largest of their 95th
+    percentiles; tip_mm: median of their tips; worst_tip_mm: the largest. degraded_rms_mm: median of the degraded ones.
+    """
+
+    least_ok: int
+    rms_mm: float = np.inf
+    worst_mm: float = np.inf
+    tip_mm: float = np.inf
+    worst_tip_mm: float = np.inf
+    degraded_rms_mm: float = np.inf
 
 
-def test_lab_is_ok_in_every_pair() -> None:
-    assert [(track.status, track.reasons) for track, _ in tracked("lab-a")] == [(Status.OK, ())] * 5
-    assert Summary.of(scores("lab-a")).false_ok == 0
+# Each pair alone, but for the sequences. lab-a is the setting of the 2017 paper: a dark needle on white, a white one on
+# dark; there every pair has to be ok.
+SEQUENCES = ("steer-b",)
+BOUNDS = {
+    "lab-a": Bounds(5, rms_mm=0.055, worst_mm=0.28, tip_mm=0.14, worst_tip_mm=0.4),
+    "steel-a": Bounds(2, rms_mm=0.047, worst_mm=0.085, tip_mm=0.07, worst_tip_mm=0.1),
+    "tissue-a": Bounds(1, rms_mm=0.12, worst_mm=0.2, tip_mm=0.3, worst_tip_mm=0.3, degraded_rms_mm=0.16),
+    "hard-a": Bounds(1, rms_mm=0.075, worst_mm=0.11, tip_mm=0.65, worst_tip_mm=0.65, degraded_rms_mm=0.1),
+    "steer-b": Bounds(9, rms_mm=0.35, worst_mm=0.85, tip_mm=0.23, worst_tip_mm=0.55, degraded_rms_mm=0.3),
+}
 
 
-def test_lab_is_accurate() -> None:
-    summary = Summary.of(scores("lab-a"))
-    assert summary.rms_mm <= 0.15
-    assert summary.tip_mm <= 0.5
-    assert summary.cover >= 0.95
+def summary(name: str) -> Summary:
+    return Summary.of(scores(name, independent=name not in SEQUENCES))
 
 
-def test_lab_states_its_own_accuracy() -> None:
-    # A Gaussian of two dimensions whose larger sigma is stated is within twice that in 86 % to 95 % of all cases.
-    assert Summary.of(scores("lab-a")).within_two_sigma >= 0.8
+def largest(values: Iterable[float | None]) -> float:
+    return max((value for value in values if value is not None), default=0.0)
+
+
+@pytest.mark.parametrize("name", BOUNDS)
+def test_as_many_pairs_are_ok_as_ever(name: str) -> None:
+    found = tracked(name, independent=name not in SEQUENCES)
+    assert summary(name).ok >= BOUNDS[name].least_ok, [track.reasons for track, _ in found]
+
+
+@pytest.mark.parametrize("name", BOUNDS)
+def test_accuracy_is_kept(name: str) -> None:
+    bounds, all_together = BOUNDS[name], summary(name)
+    ok = [one for one in scores(name, independent=name not in SEQUENCES) if one.status is Status.OK]
+    # Where there is nothing to sum up it is nan, which exceeds no bound.
+    assert not all_together.rms_mm > bounds.rms_mm
+    assert not all_together.tip_mm > bounds.tip_mm
+    assert not all_together.degraded_rms_mm > bounds.degraded_rms_mm
+    assert largest(one.worst_mm for one in ok) <= bounds.worst_mm
+    assert largest(one.tip_mm for one in ok) <= bounds.worst_tip_mm
+
+
+@pytest.mark.parametrize("name", BOUNDS)
+def test_ok_tracks_cover_the_needle_and_know_how_good_they_are(name: str) -> None:
+    all_together = summary(name)
+    if all_together.ok:
+        assert all_together.cover >= 0.95
+        # A Gaussian of two dimensions whose larger sigma is stated is within twice that in 86 % to 95 % of all cases;
+        # the errors of one needle are alike.
+        assert all_together.within_two_sigma >= 0.8
+
+
+def test_white_needles_of_the_lab_are_not_where_their_saturated_picture_is() -> None:
+    # As wide as the picture shows them their diameters are 0.23 mm and more too large, their tips up to 0.29 mm out.
+    found = tracked("lab-a")
+    for pair, diameter_mm in {0: 0.708, 2: 0.953, 3: 1.098}.items():
+        track, one = found[pair]
+        assert track.diameter_mm == pytest.approx(diameter_mm, abs=0.08)
+        assert one.tip_mm is not None
+        assert one.tip_mm < 0.15
+    assert np.median([found[pair][1].rms_mm for pair in (0, 2, 3)]) < 0.05
 
 
 def test_nothing_is_found_where_no_needle_is() -> None:
@@ -86,82 +141,3 @@ def test_a_sequence_has_its_tracks_and_no_ok_one_misleads() -> None:
 def test_frames_of_a_sequence_alone_mislead_no_more() -> None:
     assert {track.captured_at_ns for track, _ in tracked("steer-b")} == stamps("steer-b")
     assert [one for one in scores("steer-b") if one.false_ok] == []
-
-
-# The score itself: a needle along the optical axis, whose every millimetre both cameras see.
-
-LINE_MM = np.column_stack([np.zeros((121, 2)), np.linspace(220.0, 280.0, 121)])
-ALONG = np.array([0.0, 0.0, 1.0])
-TRUE = TrueShape(LINE_MM, ALONG, np.ones(121, np.bool_))
-
-
-def answer(points_mm: Float, status: Status = Status.OK) -> NeedleTrack:
-    n = len(points_mm)
-    direction = points_mm[-1] - points_mm[-2]
-    direction = direction / np.linalg.norm(direction)
-    return NeedleTrack(
-        0,
-        status,
-        () if status is Status.OK else (Reason.HIGH_RESIDUAL,),
-        NeedleCurve(points_mm, np.full(n, 0.25), np.full(n, 2), np.zeros(n), 60.0),
-        TipPose(points_mm[-1], direction, orientation_along(direction), np.eye(3), None, 2),
-        BasePose(points_mm[0], direction),
-    )
-
-
-def moved(by_mm: float) -> Float:
-    return np.asarray(LINE_MM + np.array([by_mm, 0.0, 0.0]))
-
-
-def test_the_truth_scores_nought() -> None:
-    exact = score(answer(LINE_MM), TRUE)
-    assert (exact.rms_mm, exact.worst_mm, exact.tip_mm, exact.cover) == (0.0, 0.0, 0.0, 1.0)
-    assert (exact.direction_deg, exact.turned, exact.false_ok) == (0.0, False, False)
-
-
-def test_a_shift_is_scored_as_long_as_it_is() -> None:
-    shifted = score(answer(moved(0.6)), TRUE)
-    assert shifted.rms_mm == pytest.approx(0.6)
-    assert shifted.tip_mm == pytest.approx(0.6)
-    assert shifted.off_in_sigmas is not None
-    np.testing.assert_allclose(shifted.off_in_sigmas, 0.6 / 0.25)
-    assert not shifted.false_ok
-    assert Summary.of([shifted]).within_two_sigma == 0.0
-    assert Summary.of([score(answer(moved(0.4)), TRUE)]).within_two_sigma == 1.0
-
-
-@pytest.mark.parametrize(
-    "points_mm",
-    [
-        moved(1.1),
-        LINE_MM[::-1],
-        LINE_MM[30:],
-        LINE_MM[:-3],
-        LINE_MM + np.outer(np.arange(121) < 8, [0.0, 3.0, 0.0]),
-    ],
-    ids=["shifted", "turned", "a quarter not covered", "tip 1.5 mm short", "6 % bent away"],
-)
-def test_what_would_mislead_a_robot_is_a_false_ok(points_mm: Float) -> None:
-    assert score(answer(points_mm), TRUE).false_ok
-    assert not score(answer(points_mm, Status.DEGRADED), TRUE).false_ok
-
-
-def test_anything_ok_without_a_needle_is_false() -> None:
-    assert score(answer(LINE_MM), TrueShape.none()).false_ok
-    assert not score(NeedleTrack(0, Status.INVALID, (Reason.NO_CANDIDATE,)), TrueShape.none()).false_ok
-    assert not score(NeedleTrack(0, Status.INVALID, (Reason.NO_CANDIDATE,)), TRUE).false_ok
-
-
-def test_a_tip_that_one_camera_does_not_see_is_not_scored_but_may_mislead() -> None:
-    unseen = replace(TRUE, seen=np.arange(121) < 118)
-    short = score(answer(LINE_MM[:-4]), unseen)
-    assert short.tip_mm is None
-    assert short.cover == 1.0
-    assert short.false_ok
-
-
-def test_only_ok_tracks_are_summed_up() -> None:
-    weak = score(answer(moved(0.9), Status.DEGRADED), TRUE)
-    summary = Summary.of([score(answer(moved(0.2)), TRUE), weak])
-    assert summary.ok == 1
-    assert summary.rms_mm == pytest.approx(0.2)

@@ -45,9 +45,9 @@ def fault_of(recording: AslRecording, index: int = 0) -> str:
     ("name", "pairs", "size_px"),
     [
         ("lab-a", 5, (1280, 1024)),
-        ("steel-a", 1, (1280, 1024)),
-        ("tissue-a", 1, (1280, 1024)),
-        ("hard-a", 1, (1280, 1024)),
+        ("steel-a", 2, (1280, 1024)),
+        ("tissue-a", 2, (1280, 1024)),
+        ("hard-a", 2, (1280, 1024)),
         ("absent-a", 2, (1280, 1024)),
         ("steer-b", 16, (960, 768)),
     ],

@@ -33,7 +33,7 @@ _MAX_VELOCITY_INTERVAL_NS = 250_000_000
 
 @dataclass(frozen=True, slots=True)
 class Shape:
-    """A shape and why it is not ok (empty where it is); support_mm is the length that the views show, both added.
+    """A shape and why it is not ok (empty where it is).
 
     doubts: those of the reasons that only a search of the whole images can find, or lift.
     """
@@ -41,7 +41,6 @@ class Shape:
     refined: Refined
     curve: NeedleCurve
     quality: Quality
-    support_mm: float
     reasons: tuple[Reason, ...]
     doubts: tuple[Reason, ...] = ()
 
@@ -70,11 +69,10 @@ def judged(refined: Refined, rig: StereoRig, parameters: TrackingParameters, pre
         float(sampson_distance_px(rig.fundamental, left_px, right_px)[0]),
         float(seen.all(axis=0).mean()),
     )
-    support_mm = float(sum(view.seen.mean() for view in refined.observed)) * curve.length_mm
     reasons = weaknesses(
         refined, curve, quality, rig, parameters.needle, parameters.workspace, parameters.gates, previous
     )
-    return Shape(refined, curve, quality, support_mm, reasons)
+    return Shape(refined, curve, quality, reasons)
 
 
 def differ(shape: Shape, other: Shape) -> bool:

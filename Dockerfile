@@ -7,9 +7,9 @@ FROM python:3.11-slim-bookworm AS build
 # The pinned packages change seldom and keep a layer of their own.
 WORKDIR /build
 COPY requirements/build.lock requirements/runtime.lock ./
-RUN pip install --no-cache-dir --require-hashes -r build.lock \
+RUN pip install --no-cache-dir --no-deps --require-hashes -r build.lock \
     && python -m venv /opt/needletrack \
-    && /opt/needletrack/bin/pip install --no-cache-dir --require-hashes -r runtime.lock
+    && /opt/needletrack/bin/pip install --no-cache-dir --no-deps --require-hashes -r runtime.lock
 
 COPY pyproject.toml README.md LICENSE NOTICE ./
 COPY src ./src

@@ -29,7 +29,7 @@ $(PACKAGES): requirements/dev.lock
 	  echo "make: '$(PYTHON)' lacks venv or ensurepip: on Debian and Ubuntu, apt-get install python3-venv" >&2; exit 1; }
 	@echo "Installing the pinned packages into $(VENV) (about 200 MB to fetch, once) ..."
 	@"$(PYTHON)" -m venv --clear $(VENV)
-	@$(PIP) install --require-hashes -r requirements/dev.lock >$(VENV)/install.log 2>&1 || { \
+	@$(PIP) install --no-deps --require-hashes -r requirements/dev.lock >$(VENV)/install.log 2>&1 || { \
 	  tail -n 40 $(VENV)/install.log >&2; echo "make: the packages could not be installed; the whole log: $(VENV)/install.log" >&2; exit 1; }
 	@touch $@
 

@@ -66,9 +66,9 @@ class Bounds:
 SEQUENCES = ("steer-b",)
 BOUNDS = {
     "lab-a": Bounds(5, rms_mm=0.055, worst_mm=0.28, tip_mm=0.14, worst_tip_mm=0.4),
-    "steel-a": Bounds(2, rms_mm=0.047, worst_mm=0.085, tip_mm=0.07, worst_tip_mm=0.1),
+    "steel-a": Bounds(2, rms_mm=0.047, worst_mm=0.085, tip_mm=0.14, worst_tip_mm=0.15),
     "tissue-a": Bounds(1, rms_mm=0.12, worst_mm=0.2, tip_mm=0.3, worst_tip_mm=0.3, degraded_rms_mm=0.16),
-    "hard-a": Bounds(1, rms_mm=0.075, worst_mm=0.11, tip_mm=0.65, worst_tip_mm=0.65, degraded_rms_mm=0.1),
+    "hard-a": Bounds(1, rms_mm=0.075, worst_mm=0.11, tip_mm=0.2, worst_tip_mm=0.2, degraded_rms_mm=0.14),
     "steer-b": Bounds(9, rms_mm=0.35, worst_mm=0.85, tip_mm=0.23, worst_tip_mm=0.55, degraded_rms_mm=0.3),
 }
 

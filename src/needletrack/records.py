@@ -217,12 +217,14 @@ class NeedleCurve:
 class Appearance:
     """What is the same all along a needle and in both views, as `tracking/evidence.py` numbers it.
 
-    half_width, blur, inside: indices of its half width, of the blur of the lens, of how lively its inside is.
+    half_width, blur, inside: indices of its half width, of the blur of the lens, of how lively its inside is. taper_mm:
+    length of the cone at its tip, 0 for a round end, None before it was looked at.
     """
 
     half_width: int
     blur: int
     inside: int
+    taper_mm: float | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)

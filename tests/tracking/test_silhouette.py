@@ -33,7 +33,7 @@ def sections(look: Look, wide_mm: float = 0.9, aside_mm: float = 0.0, seed: int 
 
 
 def evidence(cut: Sections, appearance: Appearance, grid: Grid = WIDE) -> AxisEvidence:
-    return axis_evidence(cut, appearance, np.full(COUNT, appearance.half_width), grid)
+    return axis_evidence(cut, appearance, np.full(COUNT, appearance.half_width), grid, np.zeros(COUNT, np.bool_))
 
 
 def common_offset_px(view: AxisEvidence) -> tuple[float, float]:
@@ -132,6 +132,44 @@ def test_the_likeliest_path_stays_on_the_needle_where_it_is_hidden() -> None:
     assert np.abs(evidence(cut, found).likeliest_path_px() - 0.1 * PX_PER_MM).max() < 0.25 * UNIT_PX + 0.06
 
 
+@pytest.mark.parametrize("by_px", [-2.5, 0.0, 2.0])
+@pytest.mark.parametrize("drift_px", [-2.0, 0.0, 1.5])
+def test_a_motion_as_a_whole_is_found_past_what_leads_aside(by_px: float, drift_px: float) -> None:
+    along = np.linspace(-0.5, 0.5, COUNT)
+    moved = line_mm(COUNT)
+    moved[:, 0] += (by_px + drift_px * along) / PX_PER_MM
+    image = picture(DARK, 0.9, np.random.default_rng(0))
+    # A dark line crosses at the end of the needle.
+    v, u = np.indices(image.shape)
+    image[(np.abs(u - 60 - 0.5 * (v - 330)) < 3) & (v > 330)] = 35
+    cut = cut_sections(image, CAMERA, moved, NEEDLE)
+    found = Appearance(16, 2, 0)
+    motion_px = evidence(cut, found).likeliest_motion_px()
+    # A shift of the grid, half a step of what is tried of drifts, and what the slope of the line makes of a pixel.
+    np.testing.assert_allclose(motion_px, by_px + drift_px * along, atol=(0.25 + 0.25) * UNIT_PX + 0.1)
+
+
+def test_what_is_before_clutter_counts_for_less_where_a_streak_leads() -> None:
+    image = picture(STEEL, 0.9, np.random.default_rng(0))
+    v, u = np.indices(image.shape)
+    from_needle = u - (80 + 0.12 * (v - 200))
+    image[(np.abs(from_needle - 9) < 3) & (v > 200)] = 100
+    cut = cut_sections(image, CAMERA, line_mm(COUNT), NEEDLE)
+    found = Appearance(16, 2, 0)
+    half_widths = np.full(COUNT, found.half_width)
+    alone, led = (
+        axis_evidence(cut, found, half_widths, NEAR, np.full(COUNT, shines)).offsets(
+            np.zeros(COUNT), np.full(COUNT, 0.4)
+        )
+        for shines in (False, True)
+    )
+    seen = alone.seen & led.seen
+    ratio = led.sigma_px[seen] / alone.sigma_px[seen]
+    even = np.arange(COUNT)[seen] < COUNT // 2 - 3
+    np.testing.assert_allclose(ratio[even], 1.0)
+    assert np.median(ratio[np.arange(COUNT)[seen] > COUNT // 2 + 3]) == 2.0
+
+
 def expected(view: AxisEvidence, at_px: float = 0.0) -> Float:
     return view.support(np.full(COUNT, at_px), np.full(COUNT, SPREADS[-1]))
 
@@ -164,7 +202,8 @@ def test_what_is_outside_the_image_or_too_thin_is_not_seen() -> None:
     view = evidence(cut, found)
     assert np.isneginf(expected(view)[out]).all()
     assert not view.offsets(np.zeros(COUNT), np.full(COUNT, 0.4)).seen[out].any()
-    thin = axis_evidence(cut, found, np.where(np.arange(COUNT) < 10, -1, found.half_width), NEAR)
+    half_widths = np.where(np.arange(COUNT) < 10, -1, found.half_width)
+    thin = axis_evidence(cut, found, half_widths, NEAR, np.zeros(COUNT, np.bool_))
     seen = thin.offsets(np.zeros(COUNT), np.full(COUNT, 0.4)).seen
     assert not seen[:10].any()
     assert seen[15:35].all()

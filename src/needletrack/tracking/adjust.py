@@ -8,17 +8,19 @@ from needletrack.geometry.spline import arc_length
 from needletrack.geometry.stereo import StereoRig
 from needletrack.records import Appearance, Float, Image, Int
 from needletrack.tracking.clipped import WHITE, WORTH_A_LOOK, Flanks, clipped_axis, clipped_share
-from needletrack.tracking.evidence import HALF_WIDTHS, NEAR, WIDE, Grid
-from needletrack.tracking.fit import CurveFit, CurveFitting, Ends, FitParameters
+from needletrack.tracking.evidence import HALF_WIDTHS, LIVELY, NEAR, WIDE, Grid
+from needletrack.tracking.fit import CurveFit, CurveFitting, Ends, FitParameters, StreakObservation
 from needletrack.tracking.needle import Needle
 from needletrack.tracking.profile import Mask
 from needletrack.tracking.silhouette import (
     AxisOffsets,
+    Sections,
     axis_evidence,
     cut_sections,
     diameter_mm,
     estimate_appearance,
 )
+from needletrack.tracking.streak import Streak, find_streak
 
 Images = tuple[Image, Image]
 
@@ -29,24 +31,27 @@ class Looks:
 
     spreads: tuple[float, ...]
     grid: Grid
+    with_streak: bool = True
 
 
-# At a rough curve; at one that was adjusted and then lengthened; at one that is settled.
-ROUGH, GROWING, SETTLED = Looks((0.7, 0.5, 0.4), WIDE), Looks((0.7, 0.4), WIDE), Looks((0.4, 0.2), NEAR)
+# At a rough curve; at one that was adjusted and then lengthened; at that of the pair before; at one that is settled.
+ROUGH, GROWING = Looks((0.7, 0.5, 0.4), WIDE, with_streak=False), Looks((0.7, 0.4), WIDE, with_streak=False)
+MOVED, SETTLED = Looks((0.7, 0.4), WIDE), Looks((0.4, 0.2), NEAR)
 
 
 @dataclass(frozen=True, slots=True)
 class Adjusted:
     """The fitted curve, what both views showed of its points, and what the needle looks like.
 
-    support (2, N): log Bayes factor, in each view, of a needle at the point over none there. flanks: what is left of a
-    needle that is clipped, or None.
+    support (2, N): log Bayes factor, in each view, of a needle at the point over none there; shines (2, N): whether a
+    streak of light shows it. flanks: what is left of a needle that is clipped, or None.
     """
 
     fit: CurveFit
     observed: tuple[AxisOffsets, AxisOffsets]
     appearance: Appearance
     support: Float
+    shines: Mask
     flanks: Flanks | None = None
 
     def part(self, start: int, stop: int) -> "Adjusted":
@@ -62,10 +67,12 @@ class Adjusted:
                 fit.points_mm[cut],
                 fit.residual_px[:, cut],
                 fit.rms_px,
+                fit.streak_misfit,
             ),
             (left.part(cut), right.part(cut)),
             self.appearance,
             self.support[:, cut],
+            self.shines[:, cut],
             self.flanks,
         )
 
@@ -79,26 +86,43 @@ def adjust(
     appearance: Appearance | None = None,
     *,
     looks: Looks = ROUGH,
+    looks_the_same: bool = False,
     before_tip: tuple[Float, float] | None = None,
     ends: Ends = ((), ()),
+    flanks: Flanks | None = None,
+    keeps_bend: bool = False,
 ) -> Adjusted:
     """The curve in space nearest to a nearly right one (N, 3), evenly spaced, that both views' silhouettes agree on.
 
-    appearance: what the needle looked like before, or None. before_tip: distance (N,) of the points from the apex and
-    the length of its taper, mm, where the needle is thinner. Raises NeedleNotFound where nothing holds a curve.
+    appearance: what the needle looked like before, or None; looks_the_same: it still does. before_tip: distance (N,)
+    of the points from the apex and the length of its taper, mm, where the needle is thinner. flanks: of a needle that
+    is clipped, as they were nearly. keeps_bend: the curve is that of the pair before. Raises NeedleNotFound where
+    nothing holds a curve.
     """
     cameras = ((rig.left, points_mm), (rig.right, rig.right_from_left.apply(points_mm)))
     sections = [
         cut_sections(image, camera, local, needle) for image, (camera, local) in zip(images, cameras, strict=True)
     ]
-    if appearance is None or before_tip is None:
+    if appearance is None or not looks_the_same:
         is_white = bool(clipped_share(images, rig, points_mm).min() > WHITE)
         appearance = estimate_appearance((sections[0], sections[1]), needle, appearance, looks.grid, is_white=is_white)
     half_widths = _half_widths(len(points_mm), appearance, before_tip)
-    evidence = [axis_evidence(each, appearance, half_widths, looks.grid) for each in sections]
+    streaks: list[Streak | None] = [None, None]
+    if looks.with_streak and appearance.inside == LIVELY:
+        streaks = [find_streak(each.values, _units(half_widths)) for each in sections]
+    shines = np.stack([np.zeros(len(points_mm), np.bool_) if each is None else each.seen for each in streaks])
+    evidence = [
+        axis_evidence(each, appearance, half_widths, looks.grid, led)
+        for each, led in zip(sections, shines, strict=True)
+    ]
+    left_line, right_line = (
+        None if streak is None else _line(streak, each, appearance)
+        for each, streak in zip(sections, streaks, strict=True)
+    )
+    lines = (left_line, right_line)
     spreads = [np.full(len(points_mm), each) for each in looks.spreads]
 
-    fitting = CurveFitting(points_mm, rig, parameters)
+    fitting = CurveFitting(points_mm, rig, parameters, keeps_bend=keeps_bend)
 
     def across(curve_mm: Float) -> list[Float]:
         return [
@@ -111,24 +135,40 @@ def adjust(
         return left, right
 
     systematic_px = parameters.systematic_px[appearance.inside]
-    expected = [each.likeliest_path_px() if looks is not SETTLED else np.zeros(len(points_mm)) for each in evidence]
+    if looks is SETTLED:
+        expected: list[Float] = [np.zeros(len(points_mm))] * 2
+    else:
+        expected = [each.likeliest_motion_px() if looks is MOVED else each.likeliest_path_px() for each in evidence]
     for spread in spreads[:-1]:
-        fitting.approach(look(expected, spread), ends)
+        fitting.approach(look(expected, spread), ends, lines)
         expected = across(fitting.points_mm())
     observed = look(expected, spreads[-1])
-    fit = fitting.fit(observed, ends, systematic_px)
+    fit = fitting.fit(observed, ends, systematic_px, lines)
     expected = across(fit.points_mm)
     support = np.stack([each.support(at, spreads[-1]) for each, at in zip(evidence, expected, strict=True)])
     if looks is not SETTLED:
-        return Adjusted(fit, observed, appearance, support)
+        return Adjusted(fit, observed, appearance, support, shines)
     is_shaft = _is_shaft(points_mm, before_tip, needle)
     if clipped_share(images, rig, fit.points_mm).max() < WORTH_A_LOOK:
-        return Adjusted(fit, observed, appearance, support)
-    found = clipped_axis(images, rig, fit.points_mm, observed, expected, diameter_mm(appearance, needle), is_shaft)
+        return Adjusted(fit, observed, appearance, support, shines)
+    seen_mm = diameter_mm(appearance, needle)
+    found = clipped_axis(images, rig, fit.points_mm, observed, expected, seen_mm, is_shaft, flanks)
     if found is None:
-        return Adjusted(fit, observed, appearance, support)
-    flanks, observed = found
-    return Adjusted(fitting.fit(observed, ends, systematic_px), observed, appearance, support, flanks)
+        return Adjusted(fit, observed, appearance, support, shines)
+    shown, observed = found
+    return Adjusted(fitting.fit(observed, ends, systematic_px, lines), observed, appearance, support, shines, shown)
+
+
+def _units(half_widths: Int) -> Float:
+    return np.where(half_widths < 0, 0.0, HALF_WIDTHS[half_widths])
+
+
+def _line(streak: Streak, sections: Sections, appearance: Appearance) -> StreakObservation:
+    scale = sections.px_per_unit
+    across = AxisOffsets(
+        sections.center_px, sections.normal, np.where(streak.seen, streak.offset, 0.0) * scale, streak.sigma * scale
+    )
+    return StreakObservation(across, float(HALF_WIDTHS[appearance.half_width] * np.median(scale)))
 
 
 def _is_shaft(points_mm: Float, before_tip: tuple[Float, float] | None, needle: Needle) -> Mask:

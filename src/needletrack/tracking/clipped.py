@@ -122,11 +122,13 @@ def clipped_axis(
     expected_px: Sequence[Float],
     seen_diameter_mm: float,
     is_shaft: Mask,
+    before: Flanks | None = None,
 ) -> tuple[Flanks, tuple[AxisOffsets, AxisOffsets]] | None:
     """The flanks of a needle about a curve (N, 3), and the offsets observed there put right where they are clipped.
 
     expected_px: offset (N,) of this curve in each view from where it was observed. is_shaft (N,): whether the needle is
-    known to have its full thickness there. None where too little is clipped, or it is no evenly bright needle.
+    known to have its full thickness there. before: its flanks as they were nearly. None where too little is clipped, or
+    it is no evenly bright needle.
     """
     cameras = ((rig.left, points_mm), (rig.right, rig.right_from_left.apply(points_mm)))
     views = [
@@ -136,7 +138,7 @@ def clipped_axis(
     if sum(0 if view is None else view.windows for view in views) < _LEAST_WINDOWS:
         return None
     px_per_mm = [camera.focal_px / float(np.median(local_mm[:, 2])) for camera, local_mm in cameras]
-    solved = _solve(views, seen_diameter_mm / 2, float(np.mean(px_per_mm)))
+    solved = _solve(views, seen_diameter_mm / 2, float(np.mean(px_per_mm)), before)
     if solved is None:
         return None
     radius_mm, blur_px, per_view = solved
@@ -144,19 +146,19 @@ def clipped_axis(
     if not -0.5 * max(blur_px) < widening_px < _MOST_WIDENING * max(blur_px):
         return None
     offsets = []
-    for view, found, before, at in zip(views, per_view, observed, expected_px, strict=True):
+    for view, found, seen, at in zip(views, per_view, observed, expected_px, strict=True):
         if view is None or found is None:
-            offsets.append(before)
+            offsets.append(seen)
             continue
         middle_px, sigma_px = found
         known = view.window >= 0
         # On a cone, or where one may be, the silhouette of such a needle is as biased as elsewhere.
         offsets.append(
             AxisOffsets(
-                before.center_px,
-                before.normal,
-                np.where(known, at + middle_px[view.window], before.offset_px),
-                np.where(known, sigma_px[view.window], np.where(is_shaft, before.sigma_px, np.inf)),
+                seen.center_px,
+                seen.normal,
+                np.where(known, at + middle_px[view.window], seen.offset_px),
+                np.where(known, sigma_px[view.window], np.where(is_shaft, seen.sigma_px, np.inf)),
             )
         )
     return Flanks(2 * radius_mm, blur_px), (offsets[0], offsets[1])
@@ -229,14 +231,17 @@ _Found = tuple[Float, Float]
 
 
 def _solve(
-    views: Sequence[_View | None], seen_radius_mm: float, px_per_mm: float
+    views: Sequence[_View | None], seen_radius_mm: float, px_per_mm: float, before: Flanks | None
 ) -> tuple[float, tuple[float, float], list[_Found | None]] | None:
     """Radius, mm, both blurs, px, and of each view its windows' middle and sigma (W,), px; None: it does not settle.
 
     Gauss-Newton over all of them at once, with steps no longer than the model is nearly linear. The windows of a view
     make a band, which radius and blurs border (Schur complement).
     """
-    radius, log_blur = seen_radius_mm - 0.6 * _BLUR_PX / px_per_mm, np.full(2, np.log(_BLUR_PX))
+    if before is None:
+        radius, log_blur = seen_radius_mm - 0.6 * _BLUR_PX / px_per_mm, np.full(2, np.log(_BLUR_PX))
+    else:
+        radius, log_blur = before.diameter_mm / 2, np.log(before.blur_px)
     middles = [np.zeros(0 if v is None else v.windows) for v in views]
     flanks = [np.zeros((0, 3)) if v is None else _first_flanks(v) for v in views]
     firsts = [each.copy() for each in flanks]

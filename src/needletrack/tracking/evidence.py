@@ -88,8 +88,15 @@ def products(sections: Float) -> Float32:
 
 def log_evidence(shown: Float32, appearance: Appearance, grid: Grid) -> Float:
     """Log evidence (N, S) of the axis at each shift of the grid, for the `products` of sections of unit noise."""
+    even, cluttered = log_evidence_by_background(shown, appearance, grid)
+    return either(even, cluttered).astype(np.float64)
+
+
+def log_evidence_by_background(shown: Float32, appearance: Appearance, grid: Grid) -> tuple[Float32, Float32]:
+    """The same (N, S) before a background that is even, and before one with clutter."""
     bank = _bank(float(HALF_WIDTHS[appearance.half_width]), BLURS[appearance.blur], appearance.inside, grid)
-    return _evidence(shown, bank).astype(np.float64)
+    even, cluttered = np.split(shown @ bank, len(_BACKGROUND_WANDER), axis=1)
+    return even, cluttered
 
 
 def log_evidence_of_no_needle(shown: Float32, blur: int) -> Float:
@@ -105,7 +112,12 @@ def log_evidence_of_no_needle(shown: Float32, blur: int) -> Float:
 
 
 def _evidence(shown: Float32, bank: Float32) -> Float32:
-    one, other = np.split(shown @ bank, len(_BACKGROUND_WANDER), axis=1)
+    even, cluttered = np.split(shown @ bank, len(_BACKGROUND_WANDER), axis=1)
+    return either(even, cluttered)
+
+
+def either(one: Float32, other: Float32) -> Float32:
+    """Log evidence (N, S) of one or the other, from that of each."""
     # np.logaddexp takes three times as long.
     return np.asarray(np.maximum(one, other) + np.log1p(np.exp(-np.abs(one - other))))
 

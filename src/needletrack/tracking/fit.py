@@ -13,6 +13,7 @@ from typing import Protocol
 import numpy as np
 import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict, Field
+from scipy.linalg import solve_triangular
 from scipy.linalg.lapack import dposv
 
 from needletrack.errors import NeedleNotFound
@@ -26,6 +27,8 @@ from needletrack.tracking.needle import Positive
 # Points triangulated from two skeletons scatter by about this much.
 _SKELETON_SIGMA_MM = 0.3
 _IDENTITY = RigidTransform.identity()
+# Sigmas by which a streak's places may be off its line before they count for less.
+_ROBUST_SIGMAS = 2.0
 
 
 class FitParameters(BaseModel):
@@ -37,15 +40,30 @@ class FitParameters(BaseModel):
     curvature_change_per_mm2: Positive = Field(
         2e-3, description="Typical change of curvature along the needle, 1/mm per mm; the bending prior."
     )
+    curvature_motion_per_mm: Positive = Field(
+        3e-3,
+        description="Typical change of curvature of a needle that is followed, from one pair to the next, 1/mm ...",
+    )
+    correlation_of_motion_mm: Positive = Field(10.0, description="... alike over this length, mm.")
     robust_px: Positive = Field(0.3, description="Offsets beyond this count for less and less (Cauchy), px.")
     correlation_mm: Positive = Field(
         1.0, description="Noise of neighbouring axis points is one error over this length, mm."
     )
     systematic_px: tuple[Positive, Positive] = Field(
-        (0.02, 0.12),
+        (0.02, 0.08),
         description="What pulls the axis aside all along a stretch, px: of a dull inside, and of a lively one.",
     )
     systematic_mm: Positive = Field(15.0, description="Length of such a stretch, mm.")
+    streak_share: Positive = Field(
+        0.3, description="Typical distance of a streak of light from the axis, as a share of the radius."
+    )
+    streak_change_share: Positive = Field(
+        0.12, description="How much that distance changes along the needle, of the radius."
+    )
+    streak_bend_share: Positive = Field(
+        0.4, description="And how much where the needle turns by a radian, of the radius."
+    )
+    streak_mm: Positive = Field(30.0, description="Length of needle over which that distance changes, mm.")
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,7 +71,8 @@ class CurveFit:
     """A fitted curve: parameters (N,) in [0, 1], control_mm (M, 3) with covariance_mm2 (3M, 3M), points_mm (N, 3).
 
     residual_px (2, N): offsets left after the fit in the left and right view, NaN where not seen; rms_px over them,
-    weighted as in the fit. The covariance is scaled up where the residuals are larger than the observations' sigmas.
+    weighted as in the fit. streak_misfit: how much more than expected a streak of light leaves its line, mean square of
+    the worse view. The covariance is scaled up where the residuals are larger than the observations' sigmas.
     """
 
     parameters: Float
@@ -62,6 +81,7 @@ class CurveFit:
     points_mm: Float
     residual_px: Float
     rms_px: float
+    streak_misfit: float = 0.0
 
     def derivative(self, order: int) -> Float:
         """Derivative (N, 3) of the curve by its parameter."""
@@ -133,6 +153,17 @@ class AcrossObservations(Protocol):
 Ends = tuple[tuple[EndObservation, ...], tuple[EndObservation, ...]]
 
 
+@dataclass(frozen=True, slots=True)
+class StreakObservation:
+    """What one view shows of a streak of light along the needle: `across` the curve, and the needle's radius_px."""
+
+    across: AcrossObservations
+    radius_px: float
+
+
+Streaks = tuple[StreakObservation | None, StreakObservation | None]
+
+
 def fit_curve(
     points_mm: Float,
     observed: tuple[AcrossObservations, AcrossObservations],
@@ -152,11 +183,16 @@ def fit_curve(
 
 
 class CurveFitting:
-    """Fits about one predicted curve (N, 3), one after another: see `fit_curve`."""
+    """Fits about one predicted curve (N, 3), one after another: see `fit_curve`.
 
-    def __init__(self, points_mm: Float, rig: StereoRig, parameters: FitParameters) -> None:
+    keeps_bend: the curve is where the needle was in the pair before, and it bends now much as it did then.
+    """
+
+    def __init__(
+        self, points_mm: Float, rig: StereoRig, parameters: FitParameters, *, keeps_bend: bool = False
+    ) -> None:
         self._rig, self._parameters = rig, parameters
-        self._length = arc_length(points_mm)
+        self._points, self._length = points_mm, arc_length(points_mm)
         whole = float(self._length[-1])
         self._u = self._length / whole
         count = _control_count(whole, parameters)
@@ -164,7 +200,10 @@ class CurveFitting:
         self._start: Float = np.asarray(np.linalg.lstsq(self._basis, points_mm, rcond=None)[0], dtype=np.float64)
         self._control = self._start
         self._smooth = _smoothness_matrix(count, whole, parameters)
-        self._held = _prior_matrix(points_mm, self._basis, whole, count, parameters) + self._smooth
+        self._bend = np.zeros_like(self._smooth)
+        if keeps_bend:
+            self._bend = _bend_matrix(self._u, count, whole, parameters)
+        self._held = _prior_matrix(points_mm, self._basis, whole, count, parameters) + self._smooth + self._bend
         self._share = min(1.0, whole / (len(points_mm) - 1) / parameters.correlation_mm)
 
     def points_mm(self) -> Float:
@@ -175,9 +214,12 @@ class CurveFitting:
         return np.asarray(points)
 
     def approach(
-        self, observed: tuple[AcrossObservations, AcrossObservations], ends: Ends = ((), ())
-    ) -> tuple[list["_View"], Float, list[tuple[Float, Float]]]:
-        """Gauss-Newton rounds towards the observations: the views, normal matrix, and what pulls where in each view."""
+        self,
+        observed: tuple[AcrossObservations, AcrossObservations],
+        ends: Ends = ((), ()),
+        streaks: Streaks = (None, None),
+    ) -> "_Approach":
+        """Gauss-Newton rounds towards what both views show; raises NeedleNotFound where one of them shows nothing."""
         if not (observed[0].seen.any() and observed[1].seen.any()):
             raise NeedleNotFound("fit", Reason.LOW_COVERAGE)
         views = [
@@ -188,13 +230,23 @@ class CurveFitting:
         ]
         weights = [np.where(view.is_across, self._share, 1.0) / view.sigma_px**2 for view in views]
         mixings = [self._basis[view.index] for view in views]
+        lines = [
+            None
+            if streak is None
+            else _Line(
+                _View(camera, pose, streak.across, ()), streak.radius_px, self._points, self._length, self._parameters
+            )
+            for camera, pose, streak in zip(
+                (self._rig.left, self._rig.right), (_IDENTITY, self._rig.right_from_left), streaks, strict=True
+            )
+        ]
         # Where no view holds the curve it stays where it was predicted.
         self._control = self._start
         normal = self._held
         pulls: list[tuple[Float, Float]] = []
         for _ in range(4):
             normal = self._held.copy()
-            gradient = -(self._smooth @ self._control.ravel())
+            gradient = -(self._smooth @ self._control.ravel()) - self._bend @ (self._control - self._start).ravel()
             points = self._basis @ self._control
             pulls = []
             for view, weight, mixing in zip(views, weights, mixings, strict=True):
@@ -206,39 +258,59 @@ class CurveFitting:
                 normal += weighted @ rows
                 gradient += weighted @ residual
                 pulls.append((weighted[:, view.is_across], self._length[view.index[view.is_across]]))
+            for line in lines:
+                if line is None:
+                    continue
+                rows, residual = line.whitened(points, self._basis)
+                normal += rows.T @ rows
+                gradient += rows.T @ residual
             step = _solved(normal, gradient).reshape(self._control.shape)
             self._control = self._control + step
             if np.abs(step).max() < 1e-3:
                 break
-        return views, normal, pulls
+        return _Approach(views, lines, normal, pulls)
 
     def fit(
         self,
         observed: tuple[AcrossObservations, AcrossObservations],
         ends: Ends = ((), ()),
         systematic_px: float = 0.0,
+        streaks: Streaks = (None, None),
     ) -> CurveFit:
         """The curve that the observations agree on, with what is left over and its covariance."""
-        views, normal, pulls = self.approach(observed, ends)
+        found = self.approach(observed, ends, streaks)
         points = self.points_mm()
         residuals = np.full((2, len(points)), np.nan)
         normalized = []
-        for row, view in zip(residuals, views, strict=True):
+        for row, view in zip(residuals, found.views, strict=True):
             left_over = view.linearized(points)[0]
             row[view.index[view.is_across]] = left_over[view.is_across]
             normalized.append(left_over / view.sigma_px)
         misfit = np.concatenate(normalized) ** 2
-        precision = np.concatenate([view.sigma_px**-2.0 for view in views])
+        precision = np.concatenate([view.sigma_px**-2.0 for view in found.views])
         rms = float(np.sqrt(misfit.sum() / precision.sum()))
         excess = max(1.0, float(misfit.mean()))
-        spread = _solved(normal, np.eye(len(normal)))
+        spread = _solved(found.normal, np.eye(len(found.normal)))
         covariance = excess * spread
-        for pull, at in pulls if systematic_px > 0 else ():
-            alike = systematic_px**2 * np.exp(-np.abs(at[:, None] - at) / self._parameters.systematic_mm)
+        streak_misfits = [0.0 if line is None else line.misfit(points) for line in found.lines]
+        for (pull, at), contradiction in zip(found.pulls, streak_misfits, strict=True) if systematic_px > 0 else ():
+            alike = np.exp(-np.abs(at[:, None] - at) / self._parameters.systematic_mm)
+            # Where streak and silhouette contradict each other either may be wrong by as much.
+            alike *= max(1.0, contradiction) * systematic_px**2
             gain = spread @ pull
             covariance = covariance + gain @ alike @ gain.T
         control = np.asarray(self._control, dtype=np.float64)
-        return CurveFit(self._u, control, np.asarray(covariance), points, residuals, rms)
+        return CurveFit(self._u, control, np.asarray(covariance), points, residuals, rms, max(streak_misfits))
+
+
+@dataclass(frozen=True, slots=True)
+class _Approach:
+    """Both views, their streaks, the normal matrix (3M, 3M), and what pulls (3M, K) each view at which lengths (K,)."""
+
+    views: list["_View"]
+    lines: list["_Line | None"]
+    normal: Float
+    pulls: list[tuple[Float, Float]]
 
 
 class _View:
@@ -275,6 +347,51 @@ class _View:
         return np.asarray(residual), np.asarray(by_local @ self._pose.rotation)
 
 
+class _Line:
+    """One view's streak: it runs beside the axis, at a distance that nobody knows but that changes slowly.
+
+    The distance is a Gaussian process along the needle, integrated out: what is left are offsets with correlated noise.
+    """
+
+    def __init__(
+        self, view: _View, radius_px: float, points_mm: Float, length_mm: Float, parameters: FitParameters
+    ) -> None:
+        self._view = view
+        at, along = length_mm[view.index], tangents(points_mm)[view.index]
+        slowly = parameters.streak_change_share**2 * _matern(np.abs(at[:, None] - at) / parameters.streak_mm)
+        turning = np.linalg.norm(along[:, None] - along, axis=2)
+        bending = parameters.streak_bend_share**2 * _matern(turning)
+        self._distance = radius_px**2 * (parameters.streak_share**2 + slowly + bending)
+        self._factor: Float | None = None
+        # Neighbouring sections blur into one another as those of the silhouette do.
+        self._variance = view.sigma_px**2 * max(1.0, parameters.correlation_mm * len(at) / max(np.ptp(length_mm), 1e-9))
+
+    def misfit(self, points_mm: Float) -> float:
+        """Mean squared offset left over about points (N, 3), in what was expected of a streak there."""
+        residual, _ = self._view.linearized(points_mm)
+        expected = self._distance + np.diag(self._variance)
+        return float(residual @ np.linalg.solve(expected, residual) / len(residual))
+
+    def whitened(self, points_mm: Float, b: Float) -> tuple[Float, Float]:
+        """Rows (K, 3M) and residuals (K,) of unit noise, linearised about points (N, 3); b (N, M) is their basis."""
+        residual, jacobian = self._view.linearized(points_mm)
+        if self._factor is None:
+            # What jumps off the line is not of it.
+            own = self._variance * np.linalg.solve(self._distance + np.diag(self._variance), residual)
+            variance = self._variance * (1 + own**2 / (_ROBUST_SIGMAS**2 * self._variance))
+            self._factor = np.asarray(np.linalg.cholesky(self._distance + np.diag(variance)), dtype=np.float64)
+        mixing = b[self._view.index]
+        rows = (mixing[:, :, None] * jacobian[:, None, :]).reshape(len(residual), -1)
+        white = solve_triangular(self._factor, np.column_stack([rows, residual]), lower=True, check_finite=False)
+        return white[:, :-1], white[:, -1]
+
+
+def _matern(apart: Float) -> Float:
+    """Matern's covariance of order 3/2 at unit length (Rasmussen & Williams 2006, eq. 4.17)."""
+    scaled = np.sqrt(3) * apart
+    return np.asarray((1 + scaled) * np.exp(-scaled))
+
+
 def _solved(normal: Float, right: Float) -> Float:
     """normal^-1 right; raises NeedleNotFound where the matrix is not positive definite."""
     _, solution, info = dposv(normal, right)
@@ -302,6 +419,13 @@ def _smoothness_matrix(count: int, length_mm: float, parameters: FitParameters) 
 def _third_derivative_squared(count: int) -> Float:
     third = _third_derivative(count)
     return np.asarray(np.kron(third.T @ third, np.eye(3)), dtype=np.float64)
+
+
+def _bend_matrix(u: Float, count: int, length_mm: float, parameters: FitParameters) -> Float:
+    """Prior on the change of the second derivative by arc length, which for a needle is that of its curvature."""
+    second = basis(u, count, derivative=2) / length_mm**2
+    weight = length_mm / len(u) / parameters.correlation_of_motion_mm / parameters.curvature_motion_per_mm**2
+    return np.asarray(np.kron(weight * second.T @ second, np.eye(3)), dtype=np.float64)
 
 
 def _prior_matrix(points_mm: Float, b: Float, length_mm: float, count: int, parameters: FitParameters) -> Float:

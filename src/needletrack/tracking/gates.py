@@ -31,6 +31,9 @@ class GateParameters(BaseModel):
     max_reprojection_rms_px: Positive = Field(
         0.12, description="Largest rms of the axis points about the projected curve, px."
     )
+    max_streak_misfit: Positive = Field(
+        4.0, description="Largest mean square of what a streak of light leaves its line by, in what is usual."
+    )
     min_coverage: float = Field(0.5, ge=0, le=1, description="Smallest share of the length that both cameras see.")
     max_epipolar_share: float = Field(
         0.5,
@@ -46,10 +49,10 @@ class GateParameters(BaseModel):
         description="Sigmas by which each view prefers an end there to a needle that goes on, and to none.",
     )
     max_tip_disagreement_mm: Positive = Field(
-        0.5, description="Largest distance along the needle between both views' tips, mm."
+        0.7, description="Largest distance along the needle between both views' tips, mm."
     )
     max_tip_epipolar_px: Positive = Field(
-        1.0, description="Largest distance of one view's tip from the other's epipolar line, px."
+        1.3, description="Largest distance of one view's tip from the other's epipolar line, px."
     )
     max_step_mm: Positive = Field(15.0, description="Largest motion of the tip since the previous pair, mm.")
 
@@ -84,7 +87,8 @@ def weaknesses(
         Reason.LOW_COVERAGE: (quality.coverage or 0.0) < parameters.min_coverage,
         Reason.ALONG_EPIPOLAR_LINES: _share_along_epipolar_lines(curve.points_mm, rig, parameters.epipolar_angle_deg)
         > parameters.max_epipolar_share,
-        Reason.HIGH_RESIDUAL: refined.fit.rms_px > parameters.max_reprojection_rms_px,
+        Reason.HIGH_RESIDUAL: refined.fit.rms_px > parameters.max_reprojection_rms_px
+        or refined.fit.streak_misfit > parameters.max_streak_misfit,
         Reason.HIGH_UNCERTAINTY: float(np.percentile(curve.sigma_mm, 95)) > parameters.max_sigma_mm
         or float(np.sqrt(np.linalg.eigvalsh(refined.tip_covariance_mm2)[-1])) > parameters.max_sigma_mm,
         Reason.TIP_NOT_SEEN: min(tip.contrast) < parameters.min_tip_contrast or not refined.tip_is_free,

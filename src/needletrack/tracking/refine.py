@@ -3,7 +3,7 @@
 Works the same from a detection and from the previous track: it needs nothing but a curve that is nearly right.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
@@ -15,7 +15,7 @@ from needletrack.geometry.spline import arc_length, resample, unit
 from needletrack.geometry.stereo import StereoRig
 from needletrack.geometry.transform import RigidTransform
 from needletrack.records import Appearance, Float, NeedleTrack, Reason
-from needletrack.tracking.adjust import GROWING, ROUGH, SETTLED, Adjusted, Images, adjust
+from needletrack.tracking.adjust import GROWING, MOVED, ROUGH, SETTLED, Adjusted, Images, adjust
 from needletrack.tracking.beside import Beside, BesideParameters, look_beside
 from needletrack.tracking.ends import (
     TIP_BEFORE_MM,
@@ -27,10 +27,21 @@ from needletrack.tracking.ends import (
     is_crossed,
     needle_stretch,
 )
+from needletrack.tracking.evidence import WIDE
 from needletrack.tracking.fit import CurveFit, EndObservation, Ends, FitParameters
 from needletrack.tracking.needle import Needle, Positive, Workspace
-from needletrack.tracking.silhouette import AxisOffsets, diameter_mm
-from needletrack.tracking.tip import BEFORE_MM, BEYOND_MM, ROW_MM, TRIED_MM, TipFit, TipParameters, find_tip
+from needletrack.tracking.profile import Mask
+from needletrack.tracking.silhouette import AxisOffsets, axis_evidence, cut_sections, diameter_mm
+from needletrack.tracking.tip import (
+    BEFORE_MM,
+    BEYOND_MM,
+    ROW_MM,
+    TRIED_AGAIN_MM,
+    TRIED_MM,
+    TipFit,
+    TipParameters,
+    find_tip,
+)
 
 MIN_DEPTH_MM = 20.0
 # How far behind a sleeve's edge the needle is looked for once more, for how long a stretch and how strong a line.
@@ -43,6 +54,14 @@ _MOST_ODDS = 30.0
 _TIP_REACH_MM, _TIP_ROUNDS = 12.0, 4
 # And once more where it was not within this of the end of the curve.
 _TIP_MOVED_MM = 0.3
+# What a needle that is followed looks like is found anew once in so many pairs.
+_PAIRS_PER_APPEARANCE = 8
+# Less than so much that looks like more of a needle beyond an end is none.
+_GOES_ON_MM = 1.5
+# Weaknesses of a track that is followed nevertheless: its shape is that of the needle, to its end.
+_STEADY_DESPITE = {Reason.TIP_DISAGREES, Reason.HIGH_UNCERTAINTY}
+# Between two pairs the tip is not expected to come further than this.
+_MOST_ADVANCE_MM = 3.0
 
 
 class RefineParameters(BaseModel):
@@ -85,11 +104,13 @@ class Refined:
 
     The points of `fit` and of `observed` correspond. tip_px holds the tip as the left and the right view alone place
     it, raw px (2, 2); tip_is_free is false where something crosses there, behind which the needle may go on. log_odds:
-    of such a needle over none, both views together; no single section has more than its say.
+    of such a needle over none, both views together; no single section has more than its say. shown (2, N): where each
+    view shows the needle, by its silhouette or by the streak of light on it.
     """
 
     fit: CurveFit
     observed: tuple[AxisOffsets, AxisOffsets]
+    shown: Mask
     appearance: Appearance
     diameter_mm: float
     base_is_known: bool
@@ -115,13 +136,18 @@ def refine(
     models: RefineModels,
     *,
     previous: NeedleTrack | None = None,
+    advance_mm: float = 0.0,
 ) -> Refined:
     """Follow the needle from a curve (N, 3) in space; raises NeedleNotFound where the views do not show it.
 
     previous: the track of the pair before, whose curve this is, which is then nearly right and tells base from tip
-    where no sleeve is seen; without it the curve is a rough one.
+    where no sleeve is seen; without it the curve is a rough one. advance_mm: how far its tip has probably come since.
     """
-    followed = _follow(images, rig, points_mm, models, previous)
+    steady = _steady(previous, models.needle)
+    if steady is None:
+        followed = _follow(images, rig, points_mm, models, previous)
+    else:
+        followed = _moved(images, rig, steady, advance_mm, models)
     spacing = models.refine.spacing_mm
     margin = round(models.refine.sleeve_reach_mm / spacing)
     extended = _extended(followed.fit.points_mm, models.refine.sleeve_reach_mm, spacing)
@@ -142,19 +168,22 @@ def refine(
     base_is_known = base is not None and not (
         stretch.sleeve is not None and _goes_on(images, rig, extended, observed, stretch, seen_diameter_mm, models)
     )
-    adjusted = adjust(
-        images,
-        rig,
-        _even(extended[stretch.start : stretch.stop], spacing),
-        models.needle,
-        models.fit,
-        followed.appearance,
-        looks=SETTLED,
-    )
-    ended = _ended(images, rig, adjusted, models)
-    if abs(ended.tip.at_mm - float(arc_length(adjusted.fit.points_mm)[-1])) > _TIP_MOVED_MM:
-        # Beyond its tip the curve was a guess, and so was what lay about it.
-        ended = _ended(images, rig, ended.final, models)
+    if steady is not None:
+        ended = _ended(images, rig, extended[stretch.start : stretch.stop], followed, models, steady)
+    else:
+        adjusted = adjust(
+            images,
+            rig,
+            _even(extended[stretch.start : stretch.stop], spacing),
+            models.needle,
+            models.fit,
+            followed.appearance,
+            looks=SETTLED,
+        )
+        ended = _ended(images, rig, adjusted.fit.points_mm, adjusted, models)
+        if abs(ended.tip.at_mm - float(arc_length(adjusted.fit.points_mm)[-1])) > _TIP_MOVED_MM:
+            # Beyond its tip the curve was a guess, and so was what lay about it.
+            ended = _ended(images, rig, ended.final.fit.points_mm, ended.final, models)
     tip, along_mm, final, ends = ended.tip, ended.along_mm, ended.final, ended.ends
     tip_px = np.stack([_tip_px(view, end[0]) for view, end in zip(final.observed, ends, strict=True)])
     beyond = _cut(along_mm, max(0.0, tip.at_mm - TIP_BEFORE_MM), tip.at_mm + TIP_BEYOND_MM, spacing)
@@ -163,7 +192,8 @@ def refine(
     return Refined(
         final.fit,
         final.observed,
-        final.appearance,
+        np.stack([view.seen for view in final.observed]) | final.shines,
+        replace(final.appearance, taper_mm=tip.taper_mm),
         diameter_mm(final.appearance, models.needle) if final.flanks is None else final.flanks.diameter_mm,
         base_is_known,
         tip,
@@ -171,6 +201,19 @@ def refine(
         tip_px,
         float(np.clip(final.support, -_MOST_ODDS, _MOST_ODDS).sum()),
     )
+
+
+@dataclass(frozen=True, slots=True)
+class _Steady:
+    """A needle that was seen whole in the pair before: its curve (N, 3), what it looked like, how its tip is shaped.
+
+    is_due: what it looks like is found anew.
+    """
+
+    points_mm: Float
+    appearance: Appearance
+    taper_mm: float
+    is_due: bool
 
 
 @dataclass(frozen=True, slots=True)
@@ -183,9 +226,16 @@ class _Ended:
     ends: Ends
 
 
-def _ended(images: Images, rig: StereoRig, adjusted: Adjusted, models: RefineModels) -> _Ended:
+def _ended(
+    images: Images,
+    rig: StereoRig,
+    curve_mm: Float,
+    adjusted: Adjusted,
+    models: RefineModels,
+    steady: _Steady | None = None,
+) -> _Ended:
     """The curve brought to an end at the tip itself; raises NeedleNotFound where hardly anything is left of it."""
-    tip, along_mm = _tip(images, rig, adjusted, models)
+    tip, along_mm = _tip(images, rig, curve_mm, adjusted, models, steady)
     if tip.at_mm < models.needle.min_length_mm / 2:
         raise NeedleNotFound("refine", Reason.TOO_SHORT)
     visible = _cut(along_mm, 0.0, tip.at_mm, models.refine.spacing_mm)
@@ -201,15 +251,22 @@ def _ended(images: Images, rig: StereoRig, adjusted: Adjusted, models: RefineMod
         models.fit,
         adjusted.appearance,
         looks=SETTLED,
+        looks_the_same=True,
         before_tip=(np.linspace(tip.at_mm, 0.0, len(visible)), tip.taper_mm),
         ends=(left, right),
+        flanks=adjusted.flanks,
+        keeps_bend=steady is not None,
     )
     return _Ended(tip, along_mm, final, (left, right))
 
 
-def _tip(images: Images, rig: StereoRig, adjusted: Adjusted, models: RefineModels) -> tuple[TipFit, Float]:
+def _tip(
+    images: Images, rig: StereoRig, curve: Float, adjusted: Adjusted, models: RefineModels, steady: _Steady | None
+) -> tuple[TipFit, Float]:
     """The tip, and the curve (N, 3) on which it lies, from the base to well beyond it."""
-    curve = adjusted.fit.points_mm
+    needle, tried_mm = models.needle, TRIED_MM
+    if steady is not None and not steady.is_due:
+        needle, tried_mm = needle.model_copy(update={"tip_tapers_mm": (steady.taper_mm,)}), TRIED_AGAIN_MM
     spacing = models.refine.spacing_mm
     along = np.concatenate([curve, _beyond(curve, round(_TIP_REACH_MM / spacing), spacing)])
     arc = arc_length(along)
@@ -221,11 +278,11 @@ def _tip(images: Images, rig: StereoRig, adjusted: Adjusted, models: RefineModel
             (image, camera, pose.apply(rows)) for image, camera, pose in zip(images, *_views(rig), strict=True)
         )
         tip = find_tip(
-            (views[0], views[1]), rows_mm, end_mm, adjusted.appearance, models.needle, models.tip, adjusted.flanks
+            (views[0], views[1]), rows_mm, end_mm, adjusted.appearance, needle, models.tip, adjusted.flanks, tried_mm
         )
         # At the border of what was tried it may lie further on.
         remaining -= 1
-        is_inside = TRIED_MM[0] + 0.2 < tip.at_mm - end_mm < TRIED_MM[1] - 0.2
+        is_inside = tried_mm[0] + 0.2 < tip.at_mm - end_mm < tried_mm[1] - 0.2
         if is_inside or remaining == 0 or not BEFORE_MM < tip.at_mm < arc[-1] - BEYOND_MM:
             return tip, along
         end_mm = tip.at_mm
@@ -275,6 +332,42 @@ def _tip_px(view: AxisOffsets, end: EndObservation) -> Float:
     return np.asarray(view.center_px[-1] + view.offset_px[-1] * normal + end.shift_px * along)
 
 
+def _steady(previous: NeedleTrack | None, needle: Needle) -> _Steady | None:
+    """What the track before tells, where it can be relied on."""
+    if previous is None or previous.curve is None or previous.appearance is None:
+        return None
+    if not set(previous.reasons) <= _STEADY_DESPITE or previous.doubts:
+        return None
+    taper_mm = previous.appearance.taper_mm
+    if taper_mm is None or taper_mm not in needle.tip_tapers_mm:
+        return None
+    return _Steady(
+        previous.curve.points_mm,
+        previous.appearance,
+        taper_mm,
+        previous.since_detection % _PAIRS_PER_APPEARANCE == _PAIRS_PER_APPEARANCE - 1,
+    )
+
+
+def _moved(images: Images, rig: StereoRig, steady: _Steady, advance_mm: float, models: RefineModels) -> Adjusted:
+    """The curve of a needle that was seen whole in the pair before, where it is now."""
+    spacing = models.refine.spacing_mm
+    points = np.concatenate([steady.points_mm, _beyond(steady.points_mm, round(_MOST_ADVANCE_MM / spacing), spacing)])
+    length_mm = float(arc_length(steady.points_mm)[-1])
+    points = _cut(points, 0.0, length_mm + float(np.clip(advance_mm, -_MOST_ADVANCE_MM, _MOST_ADVANCE_MM)), spacing)
+    return adjust(
+        images,
+        rig,
+        points,
+        models.needle,
+        models.fit,
+        steady.appearance,
+        looks=MOVED,
+        looks_the_same=not steady.is_due,
+        keeps_bend=True,
+    )
+
+
 def _follow(
     images: Images, rig: StereoRig, points_mm: Float, models: RefineModels, previous: NeedleTrack | None
 ) -> Adjusted:
@@ -303,10 +396,28 @@ def _follow(
         reach = 0 if grown_mm > min(models.refine.settled_mm, reaches[reach] / 2) else reach + 1
         if remaining == 0 or reach == len(reaches):
             break
+        if reach > 0 and not _may_go_on(images, rig, part, max(reaches), models):
+            break
         points = _extended(part.fit.points_mm, reaches[reach], spacing)
     if length_mm < models.needle.min_length_mm / 2:
         raise NeedleNotFound("refine", Reason.TOO_SHORT)
     return part
+
+
+def _may_go_on(images: Images, rig: StereoRig, part: Adjusted, reach_mm: float, models: RefineModels) -> bool:
+    """Whether anything beyond the ends of the curve, wherever it bends to, looks like a needle at all."""
+    spacing = models.refine.spacing_mm
+    even = _even(part.fit.points_mm, spacing)
+    half_width = np.full(round(reach_mm / spacing), part.appearance.half_width)
+    shown = 0
+    for outwards in (even, even[::-1]):
+        beyond = _beyond(outwards, len(half_width), spacing)
+        for image, camera, pose in zip(images, *_views(rig), strict=True):
+            sections = cut_sections(image, camera, pose.apply(beyond), models.needle)
+            evidence = axis_evidence(sections, part.appearance, half_width, WIDE, np.zeros(len(beyond), np.bool_))
+            most = np.where(sections.inside, evidence.log_evidence.max(axis=1), -np.inf)
+            shown = max(shown, int((most > models.refine.shown_log_odds).sum()))
+    return shown * spacing > _GOES_ON_MM
 
 
 def _shown(adjusted: Adjusted, models: RefineModels) -> tuple[int, int] | None:

@@ -54,7 +54,7 @@ class Shape:
 def judged(refined: Refined, rig: StereoRig, parameters: TrackingParameters, previous: NeedleTrack | None) -> Shape:
     """The refined curve as a shape with its verdict; raises NeedleNotFound where it cannot be the needle."""
     fit = refined.fit
-    seen = np.stack([view.seen for view in refined.observed])
+    seen = refined.shown
     curve = NeedleCurve(
         fit.points_mm,
         _sigma_across_mm(fit),

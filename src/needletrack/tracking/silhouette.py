@@ -22,7 +22,9 @@ from needletrack.tracking.evidence import (
     OFFSETS,
     UNITS_PER_MAX_DIAMETER,
     Grid,
+    either,
     log_evidence,
+    log_evidence_by_background,
     log_evidence_of_no_needle,
     products,
 )
@@ -41,8 +43,13 @@ _LOG_OUTLIER = -12.0
 _LOG_NEVER = -1e4
 # Log odds against the axis turning aside from a nearly right curve, per unit.
 _TURN_PRICE = 6.0
+# Differences between the motions of the two ends that are tried, units; log odds against a motion, per unit squared.
+_DRIFTS = np.linspace(-4.0, 4.0, 17)
+_MOTION_PRICE = 1.0
 # What is not noise, such as the interpolation between pixels: an axis point is no better than this, units.
 _LEAST_SIGMA = 0.03
+# What lies about the needle before clutter misleads neighbouring sections alike: together they are worth fewer of them.
+_CLUTTERED = 2.0
 # A section that narrows the expectation by less than this share tells nothing.
 _LEAST_GAIN = 0.3
 # So many sections of each view decide on the appearance; a section has at most so much of a say.
@@ -188,10 +195,14 @@ def estimate_appearance(
 
 @dataclass(frozen=True, eq=False)
 class AxisEvidence:
-    """One view's sections with the log evidence (N, S) of the axis in each, over that of no needle there."""
+    """One view's sections with the log evidence (N, S) of the axis in each, over that of no needle there.
+
+    beside_clutter (N,): where it is seen before a background that is not even, and a streak shows its way.
+    """
 
     sections: Sections
     log_evidence: Float
+    beside_clutter: Mask
     grid: Grid
 
     def offsets(self, expected_px: Float, spread: Float) -> AxisOffsets:
@@ -203,12 +214,13 @@ class AxisEvidence:
             self.sections.center_px,
             self.sections.normal,
             np.where(seen, offset, 0.0) * scale,
-            np.where(seen, sigma, np.inf) * scale,
+            np.where(seen, sigma * np.where(self.beside_clutter, _CLUTTERED, 1.0), np.inf) * scale,
         )
 
     def likeliest_path_px(self) -> Float:
         """Offsets (N,) px of the likeliest axis from end to end, which may turn aside, at a price (Viterbi 1967)."""
-        log = np.maximum(self.log_evidence - self.log_evidence.max(axis=1, keepdims=True), _LOG_OUTLIER)
+        most, _ = self._relative
+        log = np.maximum(self.log_evidence - most[:, None], _LOG_OUTLIER)
         shifts = self.grid.shifts
         price = _TURN_PRICE * np.abs(shifts[:, None] - shifts)
         for i in range(1, len(log)):
@@ -218,6 +230,22 @@ class AxisEvidence:
         for i in range(len(log) - 1, 0, -1):
             path[i - 1] = (log[i - 1] - price[path[i]]).argmax()
         return np.asarray(shifts[path] * self.sections.px_per_unit)
+
+    def likeliest_motion_px(self) -> Float:
+        """Offsets (N,) px of the likeliest axis that moved as a whole: alike everywhere, or ever more to one end."""
+        most, _ = self._relative
+        log = np.maximum(self.log_evidence - most[:, None], _LOG_OUTLIER)
+        count = len(self.grid.shifts)
+        step = self.grid.shifts[1] - self.grid.shifts[0]
+        along = np.linspace(-0.5, 0.5, len(log))
+        drift = np.rint(_DRIFTS[:, None] * along / step).astype(np.int64)
+        index = np.arange(count)[:, None] + drift[:, None]
+        told = np.where(
+            (index >= 0) & (index < count), log[np.arange(len(log)), np.clip(index, 0, count - 1)], _LOG_OUTLIER
+        )
+        worth = told.sum(axis=2) - _MOTION_PRICE * self.grid.shifts**2
+        best = np.unravel_index(int(worth.argmax()), worth.shape)
+        return np.asarray((self.grid.shifts[best[1]] + drift[best[0]] * step) * self.sections.px_per_unit)
 
     def support(self, expected_px: Float, spread: Float) -> Float:
         """Log Bayes factor (N,) of a needle about expected_px (N,), give or take spread (N,) units, over none there."""
@@ -241,15 +269,23 @@ class AxisEvidence:
         return np.asarray(np.exp(curve - curve.max(axis=1, keepdims=True)) + np.exp(_LOG_OUTLIER))
 
 
-def axis_evidence(sections: Sections, appearance: Appearance, half_widths: Int, grid: Grid) -> AxisEvidence:
-    """The evidence of sections whose half widths (N,), as indices into HALF_WIDTHS, differ; -1: too thin to say."""
+def axis_evidence(
+    sections: Sections, appearance: Appearance, half_widths: Int, grid: Grid, shines: Mask
+) -> AxisEvidence:
+    """The evidence of sections whose half widths (N,), as indices into HALF_WIDTHS, differ; -1: too thin to say.
+
+    shines (N,): where a streak of light shows the needle's way as well.
+    """
     log = np.full((len(sections.values), len(grid.shifts)), -np.inf)
+    cluttered = np.zeros(len(log), dtype=np.bool_)
     for width in np.unique(half_widths[half_widths >= 0]):
         rows = half_widths == width
         each = Appearance(int(width), appearance.blur, appearance.inside)
         shown = products(sections.values[rows])
-        log[rows] = log_evidence(shown, each, grid) - log_evidence_of_no_needle(shown, appearance.blur)[:, None]
-    return AxisEvidence(sections, log, grid)
+        before_even, before_clutter = log_evidence_by_background(shown, each, grid)
+        log[rows] = either(before_even, before_clutter) - log_evidence_of_no_needle(shown, appearance.blur)[:, None]
+        cluttered[rows] = before_clutter.max(axis=1) > before_even.max(axis=1)
+    return AxisEvidence(sections, log, cluttered & shines, grid)
 
 
 def _bell(shifts: Float, expected: Float, spread: Float) -> Float:

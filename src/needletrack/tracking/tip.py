@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
-from scipy.ndimage import gaussian_filter1d
+from scipy.ndimage import gaussian_filter, gaussian_filter1d
 from scipy.special import ndtr
 
 from needletrack.geometry.camera import Camera
@@ -28,7 +28,11 @@ BEFORE_MM, BEYOND_MM, ROW_MM = 8.0, 3.5, 0.2
 # Apexes are tried from before to beyond the rough end, coarsely, then finely about the best. What follows the needle
 # is rather too long than too short; and a round end looks like a cone of which nothing is seen, 2.5 mm further on.
 TRIED_MM = (-4.5, 2.4)
-_COARSE_MM, _FINE_MM = 0.3, 0.05
+# What was seen whole in the pair before ends near where it ended.
+TRIED_AGAIN_MM = (-1.8, 2.4)
+_COARSE_MM, _FINE_MM, _FINE_REACH_MM = 0.3, 0.05, 0.6
+# A view places the apex along the needle this far from where it is: the curve is not quite right, nor is a picture.
+_VIEW_SIGMA_MM = 0.1
 _ACROSS = np.arange(-6.5, 6.51, 0.5)
 # Parts of the inside across the needle; spacing of the pictures of them along it, mm.
 _PARTS = 5
@@ -41,7 +45,8 @@ _CORRELATED = 12.0
 _RIVAL = 3.0
 # Standard deviations, grey: of the background's level, slopes and bends, of an inside, of the difference between
 # neighbouring parts of it, and between a part on the cone and on the shaft.
-_PLANE_GRAY = (200.0, 30.0, 30.0, 30.0, 15.0, 15.0)
+_PLANE_GRAY = (200.0, 30.0, 30.0, 30.0, 15.0, 15.0, 1.0)
+_BEHIND = len(_PLANE_GRAY)
 _INSIDE_GRAY, _NEIGHBOUR_GRAY, _CONE_GRAY = 150.0, 80.0, 50.0
 
 
@@ -86,11 +91,12 @@ def find_tip(
     needle: Needle,
     parameters: TipParameters,
     flanks: Flanks | None = None,
+    tried_mm: tuple[float, float] = TRIED_MM,
 ) -> TipFit:
     """The apex near a rough end, end_mm along a curve whose rows lie at arc_mm (rows,), ROW_MM apart.
 
     images: for each view its image, its camera, and the curve (rows, 3) in that camera's frame. flanks: of a needle
-    that is clipped, and whose outline therefore lies beyond it.
+    that is clipped, and whose outline therefore lies beyond it. tried_mm: apexes, from the rough end.
     """
     pictures = [_picture(image, camera, local_mm, needle) for image, camera, local_mm in images]
     edges: list[_Edge | None] = [None, None]
@@ -100,7 +106,7 @@ def find_tip(
             _Edge(half_width, blur_px / (camera.focal_px / float(np.median(local_mm[:, 2])) * unit_mm(needle)))
             for blur_px, (_, camera, local_mm) in zip(flanks.blur_px, images, strict=True)
         ]
-    coarse = np.arange(TRIED_MM[0], TRIED_MM[1] + _COARSE_MM / 2, _COARSE_MM) + end_mm
+    coarse = np.arange(tried_mm[0], tried_mm[1] + _COARSE_MM / 2, _COARSE_MM) + end_mm
     scans = [
         [_Scan(p, arc_mm, taper, appearance, unit_mm(needle), edge) for p, edge in zip(pictures, edges, strict=True)]
         for taper in needle.tip_tapers_mm
@@ -108,24 +114,26 @@ def find_tip(
     # Every shape has its own best place, and its likelihood is too sharp to be compared on the coarse grid.
     samples = np.array([max(1.0, float(p.weight.sum())) for p in pictures])
     fine: list[tuple[Float, Float]] = []
-    for both in scans:
-        rough = np.stack([scan.misfits(coarse) for scan in both])
-        cost = _negative_log(rough, np.maximum(rough[:, :, 0].min(axis=1) / samples, _LEAST_NOISE_GRAY**2)).sum(axis=0)
-        near = np.arange(-_COARSE_MM, _COARSE_MM + _FINE_MM / 2, _FINE_MM) + coarse[int(cost.argmin())]
-        fine.append((near, np.stack([scan.misfits(near) for scan in both])))
+    for views in scans:
+        rough = np.stack([scan.misfits(coarse) for scan in views])
+        cost = _negative_log(rough, np.maximum(rough[:, :, 0].min(axis=1) / samples, _LEAST_NOISE_GRAY**2))
+        best = int(_together(coarse, cost).argmin())
+        near = np.arange(-_FINE_REACH_MM, _FINE_REACH_MM + _FINE_MM / 2, _FINE_MM) + coarse[best]
+        fine.append((near, np.stack([scan.misfits(near) for scan in views])))
     # The scale of what is left over is each view's own: that of its best fit.
     scale = np.min([found[:, :, 0].min(axis=1) for _, found in fine], axis=0) / samples
     scale = np.maximum(scale, [p.noise_gray**2 for p in pictures])
     costs = [_negative_log(found, scale) for _, found in fine]
-    tapered = int(np.argmin([cost.sum(axis=0).min() for cost in costs]))
+    both = [_together(places, cost) for (places, _), cost in zip(fine, costs, strict=True)]
+    tapered = int(np.argmin([each.min() for each in both]))
     near, found = fine[tapered]
     cost = costs[tapered]
-    at_mm, least = _lowest(near, cost.sum(axis=0)), float(cost.sum(axis=0).min())
+    at_mm, least = _lowest(near, both[tapered]), float(both[tapered].min())
     sigma = [max(parameters.min_sigma_mm, _width_mm(near, view)) for view in cost]
     # Another shape of end that explains the pictures nearly as well would put the apex elsewhere.
-    for (places, _), other in zip(fine, costs, strict=True):
-        if other is not cost and other.sum(axis=0).min() - least < _RIVAL:
-            sigma = [float(np.hypot(s, (_lowest(places, other.sum(axis=0)) - at_mm) / 2)) for s in sigma]
+    for (places, _), other in zip(fine, both, strict=True):
+        if other is not both[tapered] and other.min() - least < _RIVAL:
+            sigma = [float(np.hypot(s, (_lowest(places, other) - at_mm) / 2)) for s in sigma]
     contrast = [
         scan.contrast(arc_mm, float(of_view[:, 0].min()), float(each))
         for scan, of_view, each in zip(scans[tapered], found, scale, strict=True)
@@ -142,6 +150,12 @@ def find_tip(
 def _negative_log(found: Float, scale: Float) -> Float:
     """Negative log evidence (2, T) of both views' misfits (2, T, 2) at their scales (2,)."""
     return np.asarray(found[:, :, 0] / scale[:, None] / 2 / _CORRELATED + found[:, :, 1] / 2)
+
+
+def _together(at_mm: Float, cost: Float) -> Float:
+    """Negative log evidence (T,) of an apex at at_mm (T,) from that of each view (2, T), which may be a little off."""
+    off = 0.5 * ((at_mm[:, None] - at_mm) / _VIEW_SIGMA_MM) ** 2
+    return np.asarray((cost[:, None, :] + off).min(axis=2).sum(axis=0))
 
 
 def _lowest(at: Float, cost: Float) -> float:
@@ -189,17 +203,19 @@ class _Scan:
         edge: _Edge | None,
     ) -> None:
         self._picture, self._arc_mm = picture, arc_mm
+        half_width, blur = float(HALF_WIDTHS[appearance.half_width]), BLURS[appearance.blur]
         self._before_mm, self._inside = _inside_pictures(taper_mm, appearance, unit_length_mm, picture.sine, edge)
         x = np.broadcast_to(_ACROSS / _ACROSS[-1], picture.gray.shape)
         along = (arc_mm - arc_mm.mean()) / (np.ptp(arc_mm) / 2)
         s = np.broadcast_to(along[:, None], picture.gray.shape)
-        planes = np.stack([np.ones_like(x), x, s, x * s, x * x, s * s]).reshape(6, -1)
+        behind = _behind(picture.gray, half_width + 2 * blur)
+        planes = np.stack([np.ones_like(x), x, s, x * s, x * x, s * s, behind]).reshape(_BEHIND, -1)
         gray = (picture.gray - np.median(picture.gray)).ravel()
         # What does not depend on where the apex is, weighted: the planes, and the picture itself as a seventh.
         fixed = np.concatenate([planes, gray[None]])
         self._weighted = fixed * picture.weight.ravel()
         self._fixed = self._weighted @ fixed.T
-        self._prior = _prior(len(self._inside)) * picture.noise_gray**2
+        self._prior = _prior(len(self._inside)) * picture.noise_gray**2 * _CORRELATED
         self._log_prior = float(np.linalg.slogdet(self._prior)[1])
 
     def misfits(self, at_mm: Float) -> Float:
@@ -214,15 +230,17 @@ class _Scan:
         inside, weighted = (each.reshape(count, len(at_mm), -1).swapaxes(0, 1) for each in (inside, weighted))
         mixed = inside @ self._weighted.T
         normal = np.empty((len(at_mm), *self._prior.shape))
-        normal[:, :6, :6] = self._fixed[:6, :6]
-        normal[:, 6:, :6] = mixed[..., :6]
-        normal[:, :6, 6:] = mixed[..., :6].swapaxes(1, 2)
-        normal[:, 6:, 6:] = weighted @ inside.swapaxes(1, 2)
+        normal[:, :_BEHIND, :_BEHIND] = self._fixed[:_BEHIND, :_BEHIND]
+        normal[:, _BEHIND:, :_BEHIND] = mixed[..., :_BEHIND]
+        normal[:, :_BEHIND, _BEHIND:] = mixed[..., :_BEHIND].swapaxes(1, 2)
+        normal[:, _BEHIND:, _BEHIND:] = weighted @ inside.swapaxes(1, 2)
         normal += self._prior
-        target = np.concatenate([np.broadcast_to(self._fixed[:6, 6], (len(at_mm), 6)), mixed[..., 6]], axis=1)
+        target = np.concatenate(
+            [np.broadcast_to(self._fixed[:_BEHIND, _BEHIND], (len(at_mm), _BEHIND)), mixed[..., _BEHIND]], axis=1
+        )
         explained = (np.linalg.solve(normal, target[..., None])[..., 0] * target).sum(axis=1)
         freedom = np.linalg.slogdet(normal)[1] - self._log_prior
-        return np.column_stack([self._fixed[6, 6] - explained, freedom])
+        return np.column_stack([self._fixed[_BEHIND, _BEHIND] - explained, freedom])
 
     def contrast(self, arc_mm: Float, least: float, scale: float) -> float:
         """By how many sigmas an end of that misfit is better than a needle that goes on, and than none."""
@@ -258,21 +276,29 @@ def _inside_pictures(
     borders = np.linspace(-1, 1, _PARTS + 1)[:, None, None] * width[:, None]
     passed = ndtr((_ACROSS - borders) / blur)
     parts = passed[:-1] - passed[1:]
-    if taper_mm > 0:
-        on_cone = (before < taper_mm)[:, None]
-        parts = np.concatenate([np.where(on_cone, 0.0, parts), np.where(on_cone, parts, 0.0)])
+    on_end = (before < (taper_mm or radius_mm))[:, None]
+    parts = np.concatenate([np.where(on_end, 0.0, parts), np.where(on_end, parts, 0.0)])
     return before, np.asarray(gaussian_filter1d(parts, along_mm / _PICTURE_MM, axis=1, mode="nearest"))
+
+
+def _behind(gray: Float, reach: float) -> Float:
+    """The background (rows, columns), behind the needle, to `reach` units either side, as it is beside it."""
+    smooth = gaussian_filter(gray, (1.0, 0.7))
+    beside = np.abs(_ACROSS) > reach
+    left, right = np.flatnonzero(beside & (_ACROSS < 0))[-1], np.flatnonzero(beside & (_ACROSS > 0))[0]
+    share = np.clip((_ACROSS - _ACROSS[left]) / (_ACROSS[right] - _ACROSS[left]), 0.0, 1.0)
+    filled = np.where(beside, smooth, smooth[:, [left]] * (1 - share) + smooth[:, [right]] * share)
+    return np.asarray(filled - np.median(filled))
 
 
 def _prior(parts: int) -> Float:
     """Inverse prior covariance of the background's 6 numbers and the inside's parts, grey^-2."""
-    precision = np.zeros((6 + parts, 6 + parts))
-    precision[:6, :6] = np.diag(np.array(_PLANE_GRAY) ** -2.0)
+    precision = np.zeros((_BEHIND + parts, _BEHIND + parts))
+    precision[:_BEHIND, :_BEHIND] = np.diag(np.array(_PLANE_GRAY) ** -2.0)
     steps = np.diff(np.eye(_PARTS), axis=0) / _NEIGHBOUR_GRAY
     each = steps.T @ steps + np.eye(_PARTS) / _INSIDE_GRAY**2
-    for start in range(6, 6 + parts, _PARTS):
+    for start in range(_BEHIND, _BEHIND + parts, _PARTS):
         precision[start : start + _PARTS, start : start + _PARTS] = each
-    if parts == 2 * _PARTS:
-        apart = np.hstack([np.eye(_PARTS), -np.eye(_PARTS)]) / _CONE_GRAY
-        precision[6:, 6:] += apart.T @ apart
+    apart = np.hstack([np.eye(_PARTS), -np.eye(_PARTS)]) / _CONE_GRAY
+    precision[_BEHIND:, _BEHIND:] += apart.T @ apart
     return precision

@@ -58,7 +58,7 @@ def track_pair(
         if image.shape != camera.size_px[::-1]:
             raise ValueError(f"the {side} image is {image.shape[1]}x{image.shape[0]}, the rig says {camera.size_px}")
     stopwatch = Stopwatch()
-    followed = _followed(images, rig, parameters, previous, stopwatch)
+    followed = _followed(images, rig, parameters, previous, pair.captured_at_ns, stopwatch)
     if previous is not None and followed is not None:
         since = previous.since_detection + 1
         return as_track(followed, pair.captured_at_ns, previous, since, Evidence(), stopwatch.elapsed_ms)
@@ -75,6 +75,7 @@ def _followed(
     rig: StereoRig,
     parameters: TrackingParameters,
     previous: NeedleTrack | None,
+    captured_at_ns: int,
     stopwatch: Stopwatch,
 ) -> Shape | None:
     """The needle refined from where it was, or None where that does not hold or a search is due."""
@@ -83,13 +84,22 @@ def _followed(
     try:
         with stopwatch("refine"):
             points_mm = previous.curve.points_mm
-            refined = refine(images, rig, points_mm, _models(parameters), previous=previous)
+            advance_mm = _advance_mm(previous, captured_at_ns)
+            refined = refine(images, rig, points_mm, _models(parameters), previous=previous, advance_mm=advance_mm)
             shape = judged(refined, rig, parameters, previous).doubted(previous.doubts)
     except NeedleNotFound:
         # Lost is not yet gone: the search that follows decides, and its reason is the one that is told.
         return None
     allowed = _PAIRS_PER_SEARCH_IN_DOUBT if _IN_DOUBT & set(shape.reasons) or shape.doubts else _PAIRS_PER_SEARCH
     return shape if not shape.reasons or previous.since_detection + 1 < allowed else None
+
+
+def _advance_mm(previous: NeedleTrack, captured_at_ns: int) -> float:
+    """How far a tip that goes on as it did has come along the needle since."""
+    tip = previous.tip
+    if tip is None or tip.velocity_mm_s is None:
+        return 0.0
+    return float(tip.velocity_mm_s @ tip.direction) * (captured_at_ns - previous.captured_at_ns) * 1e-9
 
 
 def _searched(

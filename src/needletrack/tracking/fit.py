@@ -218,6 +218,7 @@ class CurveFitting:
         observed: tuple[AcrossObservations, AcrossObservations],
         ends: Ends = ((), ()),
         streaks: Streaks = (None, None),
+        rounds: int = 2,
     ) -> "_Approach":
         """Gauss-Newton rounds towards what both views show; raises NeedleNotFound where one of them shows nothing."""
         if not (observed[0].seen.any() and observed[1].seen.any()):
@@ -244,7 +245,7 @@ class CurveFitting:
         self._control = self._start
         normal = self._held
         pulls: list[tuple[Float, Float]] = []
-        for _ in range(4):
+        for _ in range(rounds):
             normal = self._held.copy()
             gradient = -(self._smooth @ self._control.ravel()) - self._bend @ (self._control - self._start).ravel()
             points = self._basis @ self._control
@@ -278,7 +279,7 @@ class CurveFitting:
         streaks: Streaks = (None, None),
     ) -> CurveFit:
         """The curve that the observations agree on, with what is left over and its covariance."""
-        found = self.approach(observed, ends, streaks)
+        found = self.approach(observed, ends, streaks, rounds=3)
         points = self.points_mm()
         residuals = np.full((2, len(points)), np.nan)
         normalized = []

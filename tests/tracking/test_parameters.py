@@ -32,7 +32,20 @@ def test_every_parameter_says_what_it_means() -> None:
 
 
 def test_lengths_angles_and_pixels_say_their_unit() -> None:
-    units = ("_mm", "_mm2", "_px", "_deg", "_gray", "_noise", "_share", "_rounds", "_candidates", "_contrast", "_misfit", "_odds")
+    units = (
+        "_mm",
+        "_mm2",
+        "_px",
+        "_deg",
+        "_gray",
+        "_noise",
+        "_share",
+        "_rounds",
+        "_candidates",
+        "_contrast",
+        "_misfit",
+        "_odds",
+    )
     plain = {"gates.min_coverage", "workspace.entry_side"}
     for name, _, kind in fields(TrackingParameters):
         if not issubclass(kind, BaseModel) or kind is Range:

@@ -41,7 +41,7 @@ class FitParameters(BaseModel):
         2e-3, description="Typical change of curvature along the needle, 1/mm per mm; the bending prior."
     )
     curvature_motion_per_mm: Positive = Field(
-        3e-3,
+        1e-3,
         description="Typical change of curvature of a needle that is followed, from one pair to the next, 1/mm ...",
     )
     correlation_of_motion_mm: Positive = Field(10.0, description="... alike over this length, mm.")

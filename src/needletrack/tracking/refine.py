@@ -58,6 +58,8 @@ _TIP_MOVED_MM = 0.3
 _PAIRS_PER_APPEARANCE = 8
 # Less than so much that looks like more of a needle beyond an end is none.
 _GOES_ON_MM = 1.5
+# Nor is it off from where its motion would take it by more than a few of these.
+_ADVANCE_SIGMA_MM = 0.6
 # Weaknesses of a track that is followed nevertheless: its shape is that of the needle, to its end.
 _STEADY_DESPITE = {Reason.TIP_DISAGREES, Reason.HIGH_UNCERTAINTY}
 # Between two pairs the tip is not expected to come further than this.
@@ -271,6 +273,7 @@ def _tip(
     along = np.concatenate([curve, _beyond(curve, round(_TIP_REACH_MM / spacing), spacing)])
     arc = arc_length(along)
     end_mm, remaining = float(arc[len(curve) - 1]), _TIP_ROUNDS
+    foreseen_mm = (end_mm, np.inf if steady is None else _ADVANCE_SIGMA_MM)
     while True:
         rows_mm = np.arange(max(0.0, end_mm - BEFORE_MM), min(end_mm + BEYOND_MM, arc[-1]), ROW_MM)
         rows = np.column_stack([np.interp(rows_mm, arc, column) for column in along.T])
@@ -278,7 +281,15 @@ def _tip(
             (image, camera, pose.apply(rows)) for image, camera, pose in zip(images, *_views(rig), strict=True)
         )
         tip = find_tip(
-            (views[0], views[1]), rows_mm, end_mm, adjusted.appearance, needle, models.tip, adjusted.flanks, tried_mm
+            (views[0], views[1]),
+            rows_mm,
+            end_mm,
+            adjusted.appearance,
+            needle,
+            models.tip,
+            adjusted.flanks,
+            tried_mm,
+            foreseen_mm,
         )
         # At the border of what was tried it may lie further on.
         remaining -= 1

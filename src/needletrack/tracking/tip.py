@@ -38,6 +38,8 @@ _ACROSS = np.arange(-6.5, 6.51, 0.5)
 _PARTS = 5
 _PICTURE_MM = 0.05
 _SATURATED_GRAY = 250
+# Profiles to either side are shifted by this many rows at most; each costs so much, grey^2 per row^2.
+_MOST_LAG, _LAG_PRICE = 24, 0.02
 _LEAST_NOISE_GRAY = 1.0
 # So many neighbouring samples err together.
 _CORRELATED = 12.0
@@ -92,11 +94,13 @@ def find_tip(
     parameters: TipParameters,
     flanks: Flanks | None = None,
     tried_mm: tuple[float, float] = TRIED_MM,
+    foreseen_mm: tuple[float, float] = (0.0, np.inf),
 ) -> TipFit:
     """The apex near a rough end, end_mm along a curve whose rows lie at arc_mm (rows,), ROW_MM apart.
 
     images: for each view its image, its camera, and the curve (rows, 3) in that camera's frame. flanks: of a needle
-    that is clipped, and whose outline therefore lies beyond it. tried_mm: apexes, from the rough end.
+    that is clipped, and whose outline therefore lies beyond it. tried_mm: apexes, from the rough end;
+    foreseen_mm: where the end was expected, and how surely.
     """
     pictures = [_picture(image, camera, local_mm, needle) for image, camera, local_mm in images]
     edges: list[_Edge | None] = [None, None]
@@ -117,14 +121,17 @@ def find_tip(
     for views in scans:
         rough = np.stack([scan.misfits(coarse) for scan in views])
         cost = _negative_log(rough, np.maximum(rough[:, :, 0].min(axis=1) / samples, _LEAST_NOISE_GRAY**2))
-        best = int(_together(coarse, cost).argmin())
+        best = int((_together(coarse, cost) + _unforeseen(coarse, foreseen_mm)).argmin())
         near = np.arange(-_FINE_REACH_MM, _FINE_REACH_MM + _FINE_MM / 2, _FINE_MM) + coarse[best]
         fine.append((near, np.stack([scan.misfits(near) for scan in views])))
     # The scale of what is left over is each view's own: that of its best fit.
     scale = np.min([found[:, :, 0].min(axis=1) for _, found in fine], axis=0) / samples
     scale = np.maximum(scale, [p.noise_gray**2 for p in pictures])
     costs = [_negative_log(found, scale) for _, found in fine]
-    both = [_together(places, cost) for (places, _), cost in zip(fine, costs, strict=True)]
+    both = [
+        _together(places, cost) + _unforeseen(places, foreseen_mm)
+        for (places, _), cost in zip(fine, costs, strict=True)
+    ]
     tapered = int(np.argmin([each.min() for each in both]))
     near, found = fine[tapered]
     cost = costs[tapered]
@@ -150,6 +157,12 @@ def find_tip(
 def _negative_log(found: Float, scale: Float) -> Float:
     """Negative log evidence (2, T) of both views' misfits (2, T, 2) at their scales (2,)."""
     return np.asarray(found[:, :, 0] / scale[:, None] / 2 / _CORRELATED + found[:, :, 1] / 2)
+
+
+def _unforeseen(at_mm: Float, foreseen_mm: tuple[float, float]) -> Float:
+    """Negative log of how likely an apex at at_mm (T,) is for where it was expected, with what sigma."""
+    expected, sigma = foreseen_mm
+    return np.asarray(0.5 * ((at_mm - expected) / sigma) ** 2)
 
 
 def _together(at_mm: Float, cost: Float) -> Float:
@@ -282,12 +295,30 @@ def _inside_pictures(
 
 
 def _behind(gray: Float, reach: float) -> Float:
-    """The background (rows, columns), behind the needle, to `reach` units either side, as it is beside it."""
+    """The background (rows, columns), behind the needle, to `reach` units either side, as it is beside it.
+
+    What crosses there, a vessel say, crosses straight: profiles to either side are alike but for a shift along.
+    """
     smooth = gaussian_filter(gray, (1.0, 0.7))
     beside = np.abs(_ACROSS) > reach
     left, right = np.flatnonzero(beside & (_ACROSS < 0))[-1], np.flatnonzero(beside & (_ACROSS > 0))[0]
     share = np.clip((_ACROSS - _ACROSS[left]) / (_ACROSS[right] - _ACROSS[left]), 0.0, 1.0)
-    filled = np.where(beside, smooth, smooth[:, [left]] * (1 - share) + smooth[:, [right]] * share)
+    rows = np.arange(len(gray), dtype=np.float64)
+    one, other = smooth[:, left], smooth[:, right]
+    lags = np.arange(-_MOST_LAG, _MOST_LAG + 1)
+    apart = [
+        float(np.mean((np.interp(rows - lag / 2, rows, one) - np.interp(rows + lag / 2, rows, other)) ** 2))
+        + _LAG_PRICE * lag**2
+        for lag in lags
+    ]
+    lag = float(lags[int(np.argmin(apart))])
+    filled = np.column_stack(
+        [
+            np.interp(rows - lag * t, rows, one) * (1 - t) + np.interp(rows + lag * (1 - t), rows, other) * t
+            for t in share
+        ]
+    )
+    filled = np.where(beside, smooth, filled)
     return np.asarray(filled - np.median(filled))
 
 

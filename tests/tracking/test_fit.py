@@ -410,7 +410,7 @@ def test_a_needle_that_is_followed_keeps_its_bend_where_it_is_not_seen() -> None
     astray[0, 140:] = np.linspace(0.0, 4.0, N - 140)
     views = observed(points_mm, true_mm, (astray[0], astray[1]), seen)
     free = CurveFitting(points_mm, RIG, PARAMETERS).fit(views)
-    kept = CurveFitting(points_mm, RIG, PARAMETERS, keeps_bend=True).fit(views)
+    kept = CurveFitting(points_mm, RIG, PARAMETERS, bent_for_s=1 / 30).fit(views)
     off_mm = [distance_from_curve(fit.points_mm[[-1]], true_mm)[0] for fit in (free, kept)]
     assert off_mm[1] < 0.6 * off_mm[0]
 
@@ -418,5 +418,5 @@ def test_a_needle_that_is_followed_keeps_its_bend_where_it_is_not_seen() -> None
 @pytest.mark.parametrize("by_mm", [0.3, 1.0])
 def test_a_needle_that_is_followed_may_move(by_mm: float) -> None:
     points_mm, true_mm = displaced(arc(BENT), by_mm), arc(BENT, beyond_mm=8.0)
-    kept = CurveFitting(points_mm, RIG, PARAMETERS, keeps_bend=True).fit(observed(points_mm, true_mm))
+    kept = CurveFitting(points_mm, RIG, PARAMETERS, bent_for_s=1 / 30).fit(observed(points_mm, true_mm))
     assert distance_from_curve(kept.points_mm, true_mm).max() < 2 * sigma_mm(kept).max()

@@ -90,13 +90,13 @@ def adjust(
     before_tip: tuple[Float, float] | None = None,
     ends: Ends = ((), ()),
     flanks: Flanks | None = None,
-    keeps_bend: bool = False,
+    bent_for_s: float | None = None,
 ) -> Adjusted:
     """The curve in space nearest to a nearly right one (N, 3), evenly spaced, that both views' silhouettes agree on.
 
     appearance: what the needle looked like before, or None; looks_the_same: it still does. before_tip: distance (N,)
     of the points from the apex and the length of its taper, mm, where the needle is thinner. flanks: of a needle that
-    is clipped, as they were nearly. keeps_bend: the curve is that of the pair before. Raises NeedleNotFound where
+    is clipped, as they were nearly. bent_for_s: the curve is that of so long ago. Raises NeedleNotFound where
     nothing holds a curve.
     """
     cameras = ((rig.left, points_mm), (rig.right, rig.right_from_left.apply(points_mm)))
@@ -122,7 +122,7 @@ def adjust(
     lines = (left_line, right_line)
     spreads = [np.full(len(points_mm), each) for each in looks.spreads]
 
-    fitting = CurveFitting(points_mm, rig, parameters, keeps_bend=keeps_bend)
+    fitting = CurveFitting(points_mm, rig, parameters, bent_for_s=bent_for_s)
 
     def across(curve_mm: Float) -> list[Float]:
         return [

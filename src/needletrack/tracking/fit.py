@@ -40,9 +40,8 @@ class FitParameters(BaseModel):
     curvature_change_per_mm2: Positive = Field(
         2e-3, description="Typical change of curvature along the needle, 1/mm per mm; the bending prior."
     )
-    curvature_motion_per_mm: Positive = Field(
-        1e-3,
-        description="Typical change of curvature of a needle that is followed, from one pair to the next, 1/mm ...",
+    curvature_motion_per_mm_s: Positive = Field(
+        0.03, description="Typical change of curvature of a needle that is followed, 1/mm a second ..."
     )
     correlation_of_motion_mm: Positive = Field(10.0, description="... alike over this length, mm.")
     robust_px: Positive = Field(0.3, description="Offsets beyond this count for less and less (Cauchy), px.")
@@ -185,11 +184,11 @@ def fit_curve(
 class CurveFitting:
     """Fits about one predicted curve (N, 3), one after another: see `fit_curve`.
 
-    keeps_bend: the curve is where the needle was in the pair before, and it bends now much as it did then.
+    bent_for_s: the curve is where the needle was so long ago, and it bends now much as it did then; None: it is not.
     """
 
     def __init__(
-        self, points_mm: Float, rig: StereoRig, parameters: FitParameters, *, keeps_bend: bool = False
+        self, points_mm: Float, rig: StereoRig, parameters: FitParameters, *, bent_for_s: float | None = None
     ) -> None:
         self._rig, self._parameters = rig, parameters
         self._points, self._length = points_mm, arc_length(points_mm)
@@ -201,8 +200,8 @@ class CurveFitting:
         self._control = self._start
         self._smooth = _smoothness_matrix(count, whole, parameters)
         self._bend = np.zeros_like(self._smooth)
-        if keeps_bend:
-            self._bend = _bend_matrix(self._u, count, whole, parameters)
+        if bent_for_s is not None:
+            self._bend = _bend_matrix(self._u, count, whole, bent_for_s, parameters)
         self._held = _prior_matrix(points_mm, self._basis, whole, count, parameters) + self._smooth + self._bend
         self._share = min(1.0, whole / (len(points_mm) - 1) / parameters.correlation_mm)
 
@@ -422,10 +421,11 @@ def _third_derivative_squared(count: int) -> Float:
     return np.asarray(np.kron(third.T @ third, np.eye(3)), dtype=np.float64)
 
 
-def _bend_matrix(u: Float, count: int, length_mm: float, parameters: FitParameters) -> Float:
+def _bend_matrix(u: Float, count: int, length_mm: float, after_s: float, parameters: FitParameters) -> Float:
     """Prior on the change of the second derivative by arc length, which for a needle is that of its curvature."""
     second = basis(u, count, derivative=2) / length_mm**2
-    weight = length_mm / len(u) / parameters.correlation_of_motion_mm / parameters.curvature_motion_per_mm**2
+    change_per_mm = parameters.curvature_motion_per_mm_s * after_s
+    weight = length_mm / len(u) / parameters.correlation_of_motion_mm / change_per_mm**2
     return np.asarray(np.kron(weight * second.T @ second, np.eye(3)), dtype=np.float64)
 
 

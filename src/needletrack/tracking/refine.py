@@ -58,8 +58,10 @@ _TIP_MOVED_MM = 0.3
 _PAIRS_PER_APPEARANCE = 8
 # Less than so much that looks like more of a needle beyond an end is none.
 _GOES_ON_MM = 1.5
-# Nor is it off from where its motion would take it by more than a few of these.
-_ADVANCE_SIGMA_MM = 0.6
+# Nor is it off from where its motion would take it by more than a few of these, a second.
+_ADVANCE_SIGMA_MM_S = 18.0
+# Images without stamps are of a sequence as fast as cameras are.
+_USUAL_S = 1 / 30
 # Weaknesses of a track that is followed nevertheless: its shape is that of the needle, to its end.
 _STEADY_DESPITE = {Reason.TIP_DISAGREES, Reason.HIGH_UNCERTAINTY}
 # Between two pairs the tip is not expected to come further than this.
@@ -138,18 +140,18 @@ def refine(
     models: RefineModels,
     *,
     previous: NeedleTrack | None = None,
-    advance_mm: float = 0.0,
+    since_s: float = 0.0,
 ) -> Refined:
     """Follow the needle from a curve (N, 3) in space; raises NeedleNotFound where the views do not show it.
 
     previous: the track of the pair before, whose curve this is, which is then nearly right and tells base from tip
-    where no sleeve is seen; without it the curve is a rough one. advance_mm: how far its tip has probably come since.
+    where no sleeve is seen; without it the curve is a rough one. since_s: how long ago it was taken; 0: nobody knows.
     """
-    steady = _steady(previous, models.needle)
+    steady = _steady(previous, since_s, models.needle)
     if steady is None:
         followed = _follow(images, rig, points_mm, models, previous)
     else:
-        followed = _moved(images, rig, steady, advance_mm, models)
+        followed = _moved(images, rig, steady, models)
     spacing = models.refine.spacing_mm
     margin = round(models.refine.sleeve_reach_mm / spacing)
     extended = _extended(followed.fit.points_mm, models.refine.sleeve_reach_mm, spacing)
@@ -209,12 +211,15 @@ def refine(
 class _Steady:
     """A needle that was seen whole in the pair before: its curve (N, 3), what it looked like, how its tip is shaped.
 
-    is_due: what it looks like is found anew.
+    since_s: how long ago that was; advance_mm: how far its tip comes in that time. is_due: what it looks like is found
+    anew.
     """
 
     points_mm: Float
     appearance: Appearance
     taper_mm: float
+    since_s: float
+    advance_mm: float
     is_due: bool
 
 
@@ -257,7 +262,7 @@ def _ended(
         before_tip=(np.linspace(tip.at_mm, 0.0, len(visible)), tip.taper_mm),
         ends=(left, right),
         flanks=adjusted.flanks,
-        keeps_bend=steady is not None,
+        bent_for_s=None if steady is None else steady.since_s,
     )
     return _Ended(tip, along_mm, final, (left, right))
 
@@ -273,7 +278,7 @@ def _tip(
     along = np.concatenate([curve, _beyond(curve, round(_TIP_REACH_MM / spacing), spacing)])
     arc = arc_length(along)
     end_mm, remaining = float(arc[len(curve) - 1]), _TIP_ROUNDS
-    foreseen_mm = (end_mm, np.inf if steady is None else _ADVANCE_SIGMA_MM)
+    foreseen_mm = (end_mm, np.inf if steady is None else _ADVANCE_SIGMA_MM_S * steady.since_s)
     while True:
         rows_mm = np.arange(max(0.0, end_mm - BEFORE_MM), min(end_mm + BEYOND_MM, arc[-1]), ROW_MM)
         rows = np.column_stack([np.interp(rows_mm, arc, column) for column in along.T])
@@ -343,29 +348,33 @@ def _tip_px(view: AxisOffsets, end: EndObservation) -> Float:
     return np.asarray(view.center_px[-1] + view.offset_px[-1] * normal + end.shift_px * along)
 
 
-def _steady(previous: NeedleTrack | None, needle: Needle) -> _Steady | None:
+def _steady(previous: NeedleTrack | None, since_s: float, needle: Needle) -> _Steady | None:
     """What the track before tells, where it can be relied on."""
     if previous is None or previous.curve is None or previous.appearance is None:
         return None
     if not set(previous.reasons) <= _STEADY_DESPITE or previous.doubts:
         return None
-    taper_mm = previous.appearance.taper_mm
+    taper_mm, tip = previous.appearance.taper_mm, previous.tip
     if taper_mm is None or taper_mm not in needle.tip_tapers_mm:
         return None
     return _Steady(
         previous.curve.points_mm,
         previous.appearance,
         taper_mm,
+        since_s if since_s > 0 else _USUAL_S,
+        0.0 if tip is None or tip.velocity_mm_s is None else float(tip.velocity_mm_s @ tip.direction) * since_s,
         previous.since_detection % _PAIRS_PER_APPEARANCE == _PAIRS_PER_APPEARANCE - 1,
     )
 
 
-def _moved(images: Images, rig: StereoRig, steady: _Steady, advance_mm: float, models: RefineModels) -> Adjusted:
+def _moved(images: Images, rig: StereoRig, steady: _Steady, models: RefineModels) -> Adjusted:
     """The curve of a needle that was seen whole in the pair before, where it is now."""
     spacing = models.refine.spacing_mm
     points = np.concatenate([steady.points_mm, _beyond(steady.points_mm, round(_MOST_ADVANCE_MM / spacing), spacing)])
     length_mm = float(arc_length(steady.points_mm)[-1])
-    points = _cut(points, 0.0, length_mm + float(np.clip(advance_mm, -_MOST_ADVANCE_MM, _MOST_ADVANCE_MM)), spacing)
+    points = _cut(
+        points, 0.0, length_mm + float(np.clip(steady.advance_mm, -_MOST_ADVANCE_MM, _MOST_ADVANCE_MM)), spacing
+    )
     return adjust(
         images,
         rig,
@@ -375,7 +384,7 @@ def _moved(images: Images, rig: StereoRig, steady: _Steady, advance_mm: float, m
         steady.appearance,
         looks=MOVED,
         looks_the_same=not steady.is_due,
-        keeps_bend=True,
+        bent_for_s=steady.since_s,
     )
 
 

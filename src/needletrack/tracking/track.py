@@ -84,22 +84,14 @@ def _followed(
     try:
         with stopwatch("refine"):
             points_mm = previous.curve.points_mm
-            advance_mm = _advance_mm(previous, captured_at_ns)
-            refined = refine(images, rig, points_mm, _models(parameters), previous=previous, advance_mm=advance_mm)
+            since_s = (captured_at_ns - previous.captured_at_ns) * 1e-9
+            refined = refine(images, rig, points_mm, _models(parameters), previous=previous, since_s=since_s)
             shape = judged(refined, rig, parameters, previous).doubted(previous.doubts)
     except NeedleNotFound:
         # Lost is not yet gone: the search that follows decides, and its reason is the one that is told.
         return None
     allowed = _PAIRS_PER_SEARCH_IN_DOUBT if _IN_DOUBT & set(shape.reasons) or shape.doubts else _PAIRS_PER_SEARCH
     return shape if not shape.reasons or previous.since_detection + 1 < allowed else None
-
-
-def _advance_mm(previous: NeedleTrack, captured_at_ns: int) -> float:
-    """How far a tip that goes on as it did has come along the needle since."""
-    tip = previous.tip
-    if tip is None or tip.velocity_mm_s is None:
-        return 0.0
-    return float(tip.velocity_mm_s @ tip.direction) * (captured_at_ns - previous.captured_at_ns) * 1e-9
 
 
 def _searched(

@@ -352,8 +352,15 @@ STREAK_SIGMA_PX = 0.05
 
 def streak(seen: AxisOffsets, aside_px: Float) -> StreakObservation:
     """A line beside the true axis, off by aside_px (N,), in the view that sees the axis so."""
-    sigma = np.full(N, STREAK_SIGMA_PX)
-    return StreakObservation(AxisOffsets(seen.center_px, seen.normal, seen.offset_px + aside_px, sigma), RADIUS_PX)
+    return StreakObservation(seen.offset_px + aside_px, np.full(N, STREAK_SIGMA_PX), RADIUS_PX)
+
+
+def led(
+    points_mm: Float,
+    views: tuple[AxisOffsets, AxisOffsets],
+    streaks: tuple[StreakObservation | None, StreakObservation | None],
+) -> CurveFit:
+    return CurveFitting(points_mm, RIG, PARAMETERS, views, streaks=streaks).fit(views)
 
 
 def wound_mm(points_mm: Float, by_mm: float) -> Float:
@@ -368,16 +375,16 @@ def test_a_streak_tells_how_a_curve_winds_where_its_silhouette_is_hidden() -> No
     views = observed(points_mm, true_mm, seen=seen_but(1, slice(30, 140)))
     _, right = observed(points_mm, true_mm)
     aside_px = np.full(N, 0.6 * RADIUS_PX)
-    without = CurveFitting(points_mm, RIG, PARAMETERS).fit(views)
-    led = CurveFitting(points_mm, RIG, PARAMETERS).fit(views, streaks=(None, streak(right, aside_px)))
+    without = fit_curve(points_mm, views, RIG, PARAMETERS)
+    with_it = led(points_mm, views, (None, streak(right, aside_px)))
     hidden = slice(40, 130)
-    off_mm = distance_from_curve(led.points_mm, true_mm)[hidden]
+    off_mm = distance_from_curve(with_it.points_mm, true_mm)[hidden]
     assert np.sqrt((off_mm**2).mean()) < 0.25 * np.sqrt(
         (distance_from_curve(without.points_mm, true_mm)[hidden] ** 2).mean()
     )
-    assert sigma_mm(led)[85] < 0.5 * sigma_mm(without)[85]
+    assert sigma_mm(with_it)[85] < 0.5 * sigma_mm(without)[85]
     # And no more is claimed than holds: that it keeps its place is known to a tenth of the radius.
-    assert (off_mm < 2 * sigma_mm(led)[hidden]).mean() > 0.9
+    assert (off_mm < 2 * sigma_mm(with_it)[hidden]).mean() > 0.9
 
 
 @pytest.mark.parametrize("share", [-0.8, -0.3, 0.5, 0.9])
@@ -386,7 +393,7 @@ def test_where_a_streak_lies_does_not_pull_the_axis(share: float) -> None:
     left, right = views = observed(points_mm, true_mm)
     plain = fit_curve(points_mm, views, RIG, PARAMETERS)
     aside = np.full(N, share * RADIUS_PX)
-    pulled = CurveFitting(points_mm, RIG, PARAMETERS).fit(views, streaks=(streak(left, aside), streak(right, -aside)))
+    pulled = led(points_mm, views, (streak(left, aside), streak(right, -aside)))
     moved_mm = np.linalg.norm(pulled.points_mm - plain.points_mm, axis=1)
     # Taken for the axis it would pull by half that share of the radius, 0.2 mm and more.
     assert moved_mm.max() < 0.5 * sigma_mm(plain).min()
@@ -397,7 +404,7 @@ def test_a_streak_that_jumps_counts_for_little() -> None:
     left, right = views = observed(points_mm, true_mm)
     aside = np.zeros(N)
     aside[80:90] = 0.8 * RADIUS_PX
-    fit = CurveFitting(points_mm, RIG, PARAMETERS).fit(views, streaks=(streak(left, aside), streak(right, -aside)))
+    fit = led(points_mm, views, (streak(left, aside), streak(right, -aside)))
     # Taken for the axis, 2 px in both views would be 0.36 mm across.
     assert distance_from_curve(fit.points_mm, true_mm).max() < 0.1
 
@@ -409,8 +416,8 @@ def test_a_needle_that_is_followed_keeps_its_bend_where_it_is_not_seen() -> None
     astray = np.zeros((2, N))
     astray[0, 140:] = np.linspace(0.0, 4.0, N - 140)
     views = observed(points_mm, true_mm, (astray[0], astray[1]), seen)
-    free = CurveFitting(points_mm, RIG, PARAMETERS).fit(views)
-    kept = CurveFitting(points_mm, RIG, PARAMETERS, bent_for_s=1 / 30).fit(views)
+    free = fit_curve(points_mm, views, RIG, PARAMETERS)
+    kept = CurveFitting(points_mm, RIG, PARAMETERS, views, bent_for_s=1 / 30).fit(views)
     off_mm = [distance_from_curve(fit.points_mm[[-1]], true_mm)[0] for fit in (free, kept)]
     assert off_mm[1] < 0.6 * off_mm[0]
 
@@ -418,5 +425,6 @@ def test_a_needle_that_is_followed_keeps_its_bend_where_it_is_not_seen() -> None
 @pytest.mark.parametrize("by_mm", [0.3, 1.0])
 def test_a_needle_that_is_followed_may_move(by_mm: float) -> None:
     points_mm, true_mm = displaced(arc(BENT), by_mm), arc(BENT, beyond_mm=8.0)
-    kept = CurveFitting(points_mm, RIG, PARAMETERS, bent_for_s=1 / 30).fit(observed(points_mm, true_mm))
+    views = observed(points_mm, true_mm)
+    kept = CurveFitting(points_mm, RIG, PARAMETERS, views, bent_for_s=1 / 30).fit(views)
     assert distance_from_curve(kept.points_mm, true_mm).max() < 2 * sigma_mm(kept).max()

@@ -35,6 +35,7 @@ def test_lengths_angles_and_pixels_say_their_unit() -> None:
     units = (
         "_mm",
         "_mm2",
+        "_mm_s",
         "_px",
         "_deg",
         "_gray",

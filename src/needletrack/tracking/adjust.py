@@ -119,10 +119,16 @@ def adjust(
         None if streak is None else _line(streak, each, appearance)
         for each, streak in zip(sections, streaks, strict=True)
     )
-    lines = (left_line, right_line)
     spreads = [np.full(len(points_mm), each) for each in looks.spreads]
 
-    fitting = CurveFitting(points_mm, rig, parameters, bent_for_s=bent_for_s)
+    fitting = CurveFitting(
+        points_mm,
+        rig,
+        parameters,
+        (sections[0], sections[1]),
+        streaks=(left_line, right_line),
+        bent_for_s=bent_for_s,
+    )
 
     def across(curve_mm: Float) -> list[Float]:
         return [
@@ -140,10 +146,10 @@ def adjust(
     else:
         expected = [each.likeliest_motion_px() if looks is MOVED else each.likeliest_path_px() for each in evidence]
     for spread in spreads[:-1]:
-        fitting.approach(look(expected, spread), ends, lines)
+        fitting.approach(look(expected, spread), ends)
         expected = across(fitting.points_mm())
     observed = look(expected, spreads[-1])
-    fit = fitting.fit(observed, ends, systematic_px, lines)
+    fit = fitting.fit(observed, ends, systematic_px)
     expected = across(fit.points_mm)
     support = np.stack([each.support(at, spreads[-1]) for each, at in zip(evidence, expected, strict=True)])
     if looks is not SETTLED:
@@ -156,7 +162,7 @@ def adjust(
     if found is None:
         return Adjusted(fit, observed, appearance, support, shines)
     shown, observed = found
-    return Adjusted(fitting.fit(observed, ends, systematic_px, lines), observed, appearance, support, shines, shown)
+    return Adjusted(fitting.fit(observed, ends, systematic_px), observed, appearance, support, shines, shown)
 
 
 def _units(half_widths: Int) -> Float:
@@ -165,10 +171,8 @@ def _units(half_widths: Int) -> Float:
 
 def _line(streak: Streak, sections: Sections, appearance: Appearance) -> StreakObservation:
     scale = sections.px_per_unit
-    across = AxisOffsets(
-        sections.center_px, sections.normal, np.where(streak.seen, streak.offset, 0.0) * scale, streak.sigma * scale
-    )
-    return StreakObservation(across, float(HALF_WIDTHS[appearance.half_width] * np.median(scale)))
+    radius_px = float(HALF_WIDTHS[appearance.half_width] * np.median(scale))
+    return StreakObservation(np.where(streak.seen, streak.offset, 0.0) * scale, streak.sigma * scale, radius_px)
 
 
 def _is_shaft(points_mm: Float, before_tip: tuple[Float, float] | None, needle: Needle) -> Mask:

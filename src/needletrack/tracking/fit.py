@@ -13,7 +13,6 @@ from typing import Protocol
 import numpy as np
 import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict, Field
-from scipy.linalg import solve_triangular
 from scipy.linalg.lapack import dposv
 
 from needletrack.errors import NeedleNotFound
@@ -29,6 +28,8 @@ _SKELETON_SIGMA_MM = 0.3
 _IDENTITY = RigidTransform.identity()
 # Sigmas by which a streak's places may be off its line before they count for less.
 _ROBUST_SIGMAS = 2.0
+# Robust weights settle in so many rounds.
+_ROUNDS = 2
 
 
 class FitParameters(BaseModel):
@@ -125,16 +126,20 @@ class EndObservation:
     sigma_px: float
 
 
-class AcrossObservations(Protocol):
-    """What one view shows across a curve of N points, as `AxisOffsets` does."""
+class Sections(Protocol):
+    """Where the cross sections of a curve of N points lie in one view, as `silhouette.Sections` does."""
 
     @property
     def center_px(self) -> Float:
-        """Where each cross section was taken, raw px (N, 2)."""
+        """Where each was taken, raw px (N, 2)."""
 
     @property
     def normal(self) -> Float:
         """Its direction, (N, 2)."""
+
+
+class AcrossObservations(Sections, Protocol):
+    """What one view shows across a curve of N points, as `AxisOffsets` does."""
 
     @property
     def offset_px(self) -> Float:
@@ -154,9 +159,13 @@ Ends = tuple[tuple[EndObservation, ...], tuple[EndObservation, ...]]
 
 @dataclass(frozen=True, slots=True)
 class StreakObservation:
-    """What one view shows of a streak of light along the needle: `across` the curve, and the needle's radius_px."""
+    """What one view shows of a streak of light along the needle, across the same sections; and the needle's radius_px.
 
-    across: AcrossObservations
+    offset_px, sigma_px (N,): infinite sigmas where it is not seen.
+    """
+
+    offset_px: Float
+    sigma_px: Float
     radius_px: float
 
 
@@ -178,20 +187,28 @@ def fit_curve(
     sandwich); 0 leaves that, and its cost, out.
     Raises NeedleNotFound where nothing holds a curve.
     """
-    return CurveFitting(points_mm, rig, parameters).fit(observed, ends, systematic_px)
+    return CurveFitting(points_mm, rig, parameters, observed).fit(observed, ends, systematic_px)
 
 
 class CurveFitting:
-    """Fits about one predicted curve (N, 3), one after another: see `fit_curve`.
+    """Fits about one predicted curve (N, 3) and the sections across it, one after another: see `fit_curve`.
 
-    bent_for_s: the curve is where the needle was so long ago, and it bends now much as it did then; None: it is not.
+    streaks: of light, which run beside the axis. bent_for_s: the curve is where the needle was so long ago, and it
+    bends now much as it did then; None: it is not.
     """
 
     def __init__(
-        self, points_mm: Float, rig: StereoRig, parameters: FitParameters, *, bent_for_s: float | None = None
+        self,
+        points_mm: Float,
+        rig: StereoRig,
+        parameters: FitParameters,
+        sections: tuple[Sections, Sections],
+        *,
+        streaks: Streaks = (None, None),
+        bent_for_s: float | None = None,
     ) -> None:
-        self._rig, self._parameters = rig, parameters
-        self._points, self._length = points_mm, arc_length(points_mm)
+        self._parameters = parameters
+        self._length = arc_length(points_mm)
         whole = float(self._length[-1])
         self._u = self._length / whole
         count = _control_count(whole, parameters)
@@ -204,6 +221,16 @@ class CurveFitting:
             self._bend = _bend_matrix(self._u, count, whole, bent_for_s, parameters)
         self._held = _prior_matrix(points_mm, self._basis, whole, count, parameters) + self._smooth + self._bend
         self._share = min(1.0, whole / (len(points_mm) - 1) / parameters.correlation_mm)
+        self._views = [
+            _View(camera, pose, each)
+            for camera, pose, each in zip(
+                (rig.left, rig.right), (_IDENTITY, rig.right_from_left), sections, strict=True
+            )
+        ]
+        self._lines = [
+            None if streak is None else _Line(view, streak, points_mm, self._length, self._basis, parameters)
+            for view, streak in zip(self._views, streaks, strict=True)
+        ]
 
     def points_mm(self) -> Float:
         """The curve (N, 3) so far; raises NeedleNotFound where it is none."""
@@ -212,87 +239,63 @@ class CurveFitting:
             raise NeedleNotFound("fit", Reason.HIGH_UNCERTAINTY)
         return np.asarray(points)
 
-    def approach(
-        self,
-        observed: tuple[AcrossObservations, AcrossObservations],
-        ends: Ends = ((), ()),
-        streaks: Streaks = (None, None),
-        rounds: int = 2,
-    ) -> "_Approach":
-        """Gauss-Newton rounds towards what both views show; raises NeedleNotFound where one of them shows nothing."""
+    def approach(self, observed: tuple[AcrossObservations, AcrossObservations], ends: Ends = ((), ())) -> "_Approach":
+        """One step of Gauss-Newton from where the curve is, its weights settled in rounds.
+
+        Raises NeedleNotFound where one of the views shows nothing.
+        """
         if not (observed[0].seen.any() and observed[1].seen.any()):
             raise NeedleNotFound("fit", Reason.LOW_COVERAGE)
-        views = [
-            _View(camera, pose, seen, end)
-            for camera, pose, seen, end in zip(
-                (self._rig.left, self._rig.right), (_IDENTITY, self._rig.right_from_left), observed, ends, strict=True
-            )
+        points, moved = self.points_mm(), (self._control - self._start).ravel()
+        # What is measured counts from the start: where no view holds the curve it stays where it was predicted.
+        seen = [
+            view.measured(points, each, end, self._basis, self._share, moved)
+            for view, each, end in zip(self._views, observed, ends, strict=True)
         ]
-        weights = [np.where(view.is_across, self._share, 1.0) / view.sigma_px**2 for view in views]
-        mixings = [self._basis[view.index] for view in views]
-        lines = [
-            None
-            if streak is None
-            else _Line(
-                _View(camera, pose, streak.across, ()), streak.radius_px, self._points, self._length, self._parameters
-            )
-            for camera, pose, streak in zip(
-                (self._rig.left, self._rig.right), (_IDENTITY, self._rig.right_from_left), streaks, strict=True
-            )
+        lines = [line.normal(points, self._basis, moved) for line in self._lines if line is not None]
+        fixed = self._held + sum(normal for normal, _ in lines)
+        pull = sum(pull for _, pull in lines) - self._smooth @ self._start.ravel()
+        normal, weighted, step = fixed, [each.rows for each in seen], moved
+        for _ in range(_ROUNDS):
+            off = [each.residual - each.rows @ step for each in seen]
+            robust = [
+                each.weight / (1 + (left / np.maximum(self._parameters.robust_px, each.sigma_px)) ** 2)
+                for each, left in zip(seen, off, strict=True)
+            ]
+            weighted = [each.rows * each_weight[:, None] for each, each_weight in zip(seen, robust, strict=True)]
+            normal = fixed + sum(w.T @ each.rows for w, each in zip(weighted, seen, strict=True))
+            step = _solved(normal, pull + sum(w.T @ each.residual for w, each in zip(weighted, seen, strict=True)))
+        self._control = self._start + step.reshape(self._start.shape)
+        pulls = [
+            (w[each.is_across].T, self._length[each.index[each.is_across]])
+            for w, each in zip(weighted, seen, strict=True)
         ]
-        # Where no view holds the curve it stays where it was predicted.
-        self._control = self._start
-        normal = self._held
-        pulls: list[tuple[Float, Float]] = []
-        for _ in range(rounds):
-            normal = self._held.copy()
-            gradient = -(self._smooth @ self._control.ravel()) - self._bend @ (self._control - self._start).ravel()
-            points = self._basis @ self._control
-            pulls = []
-            for view, weight, mixing in zip(views, weights, mixings, strict=True):
-                residual, jacobian = view.linearized(points)
-                robust = weight / (1 + (residual / np.maximum(self._parameters.robust_px, view.sigma_px)) ** 2)
-                # One row per point and view: d(offset)/d(control) = basis (x) d(offset)/d(point).
-                rows = (mixing[:, :, None] * jacobian[:, None, :]).reshape(len(residual), -1)
-                weighted = (robust[:, None] * rows).T
-                normal += weighted @ rows
-                gradient += weighted @ residual
-                pulls.append((weighted[:, view.is_across], self._length[view.index[view.is_across]]))
-            for line in lines:
-                if line is None:
-                    continue
-                rows, residual = line.whitened(points, self._basis)
-                normal += rows.T @ rows
-                gradient += rows.T @ residual
-            step = _solved(normal, gradient).reshape(self._control.shape)
-            self._control = self._control + step
-            if np.abs(step).max() < 1e-3:
-                break
-        return _Approach(views, lines, normal, pulls)
+        return _Approach(seen, normal, pulls)
 
     def fit(
         self,
         observed: tuple[AcrossObservations, AcrossObservations],
         ends: Ends = ((), ()),
         systematic_px: float = 0.0,
-        streaks: Streaks = (None, None),
     ) -> CurveFit:
         """The curve that the observations agree on, with what is left over and its covariance."""
-        found = self.approach(observed, ends, streaks, rounds=3)
+        self.approach(observed, ends)
+        found = self.approach(observed, ends)
         points = self.points_mm()
+        moved = (self._control - self._start).ravel()
         residuals = np.full((2, len(points)), np.nan)
         normalized = []
-        for row, view in zip(residuals, found.views, strict=True):
-            left_over = view.linearized(points)[0]
-            row[view.index[view.is_across]] = left_over[view.is_across]
-            normalized.append(left_over / view.sigma_px)
+        for row, each in zip(residuals, found.seen, strict=True):
+            left_over = each.residual - each.rows @ moved
+            row[each.index[each.is_across]] = left_over[each.is_across]
+            normalized.append(left_over / each.sigma_px)
         misfit = np.concatenate(normalized) ** 2
-        precision = np.concatenate([view.sigma_px**-2.0 for view in found.views])
+        precision = np.concatenate([each.sigma_px**-2.0 for each in found.seen])
         rms = float(np.sqrt(misfit.sum() / precision.sum()))
         excess = max(1.0, float(misfit.mean()))
         spread = _solved(found.normal, np.eye(len(found.normal)))
         covariance = excess * spread
-        streak_misfits = [0.0 if line is None else line.misfit(points) for line in found.lines]
+        streak_misfits = [0.0 if line is None else line.misfit(points) for line in self._lines]
         for (pull, at), contradiction in zip(found.pulls, streak_misfits, strict=True) if systematic_px > 0 else ():
             alike = np.exp(-np.abs(at[:, None] - at) / self._parameters.systematic_mm)
             # Where streak and silhouette contradict each other either may be wrong by as much.
@@ -304,45 +307,86 @@ class CurveFitting:
 
 
 @dataclass(frozen=True, slots=True)
-class _Approach:
-    """Both views, their streaks, the normal matrix (3M, 3M), and what pulls (3M, K) each view at which lengths (K,)."""
+class _Measured:
+    """What one view measures at K points: index (K,), whether across the curve or along it, sigma_px and weight (K,).
 
-    views: list["_View"]
-    lines: list["_Line | None"]
+    residual (K,) px, rows (K, 3M): offsets of the start of the curve, and their derivatives by its control points.
+    """
+
+    index: npt.NDArray[np.int64]
+    is_across: npt.NDArray[np.bool_]
+    sigma_px: Float
+    weight: Float
+    residual: Float
+    rows: Float
+
+
+@dataclass(frozen=True, slots=True)
+class _Approach:
+    """What both views measure, the normal matrix (3M, 3M), and what pulls (3M, K) each view at which lengths (K,)."""
+
+    seen: list[_Measured]
     normal: Float
     pulls: list[tuple[Float, Float]]
 
 
 class _View:
-    """One view's observations in undistorted pixels, ready for linearising."""
+    """One view's sections in undistorted pixels, ready for linearising."""
 
-    def __init__(
-        self, camera: Camera, pose: RigidTransform, seen: AcrossObservations, ends: tuple[EndObservation, ...]
-    ) -> None:
-        across = np.flatnonzero(seen.seen)
-        at_ends = np.array([end.index for end in ends], dtype=np.int64)
-        self.index = np.concatenate([across, at_ends])
-        self.is_across = np.arange(len(self.index)) < len(across)
-        self.sigma_px = np.concatenate([seen.sigma_px[across], [end.sigma_px for end in ends]])
-        normal = seen.normal[self.index]
-        # At an end the curve is measured along itself, which is the normal turned by a quarter.
-        normal[len(across) :] = np.column_stack([normal[len(across) :, 1], -normal[len(across) :, 0]])
-        offset = np.concatenate([seen.offset_px[across], [end.shift_px for end in ends]])
-        center = seen.center_px[self.index]
-        undistorted = camera.undistort(np.concatenate([center + offset[:, None] * normal, center + normal, center]))
-        self.target_px, there, here = undistorted.reshape(3, -1, 2)
-        ahead = there - here
-        self.normal = ahead / np.maximum(np.linalg.norm(ahead, axis=1, keepdims=True), 1e-12)
-        self._camera, self._pose = camera, pose
+    def __init__(self, camera: Camera, pose: RigidTransform, sections: Sections) -> None:
+        self._camera, self._pose, self._sections = camera, pose, sections
+        self._here_px, self._ahead = self._undistorted(sections.center_px, sections.normal)
 
-    def linearized(self, points_mm: Float) -> tuple[Float, Float]:
-        """Offsets (K,) still missing across the curve, px, and their derivatives (K, 3) by the points in space."""
-        local = self._pose.apply(points_mm[self.index])
+    def _undistorted(self, center_px: Float, direction: Float) -> tuple[Float, Float]:
+        """Undistorted places (K, 2), and what a raw pixel along the directions (K, 2) is there (K, 2)."""
+        # Over the few pixels of an offset the distortion is linear to 1e-4 px.
+        here, there = self._camera.undistort(np.concatenate([center_px, center_px + direction])).reshape(2, -1, 2)
+        return here, there - here
+
+    def measured(
+        self,
+        points_mm: Float,
+        observed: AcrossObservations,
+        ends: tuple[EndObservation, ...],
+        b: Float,
+        share: float,
+        moved: Float,
+    ) -> _Measured:
+        """What is observed of a curve that is now at points (N, 3), by the control points of which it moved (3M,)."""
+        across = np.flatnonzero(observed.seen)
+        residual, jacobian = self.linearized(points_mm, across, observed.offset_px)
+        index, sigma = across, observed.sigma_px[across]
+        if ends:
+            at = np.array([end.index for end in ends], dtype=np.int64)
+            normal = self._sections.normal[at]
+            # At an end the curve is measured along itself, which is the normal turned by a quarter.
+            here, ahead = self._undistorted(
+                self._sections.center_px[at], np.column_stack([normal[:, 1], -normal[:, 0]])
+            )
+            shift = np.array([end.shift_px for end in ends])
+            end_residual, end_jacobian = self._by_points(points_mm[at], here + shift[:, None] * ahead, ahead)
+            index = np.concatenate([across, at])
+            sigma = np.concatenate([sigma, [end.sigma_px for end in ends]])
+            residual = np.concatenate([residual, end_residual])
+            jacobian = np.concatenate([jacobian, end_jacobian])
+        is_across = np.arange(len(index)) < len(across)
+        rows = _rows(b[index], jacobian)
+        weight = np.where(is_across, share, 1.0) / sigma**2
+        return _Measured(index, is_across, sigma, weight, residual + rows @ moved, rows)
+
+    def linearized(self, points_mm: Float, index: npt.NDArray[np.int64], offset_px: Float) -> tuple[Float, Float]:
+        """Offsets (K,) px that a curve (N, 3) misses at sections index (K,), and derivatives (K, 3) by its points."""
+        ahead = self._ahead[index]
+        return self._by_points(points_mm[index], self._here_px[index] + offset_px[index, None] * ahead, ahead)
+
+    def _by_points(self, points_mm: Float, target_px: Float, ahead: Float) -> tuple[Float, Float]:
+        normal = ahead / np.maximum(np.linalg.norm(ahead, axis=1, keepdims=True), 1e-12)
+        local = self._pose.apply(points_mm)
         depth = local[:, 2:]
         ray = local[:, :2] / depth
         matrix = self._camera.matrix
-        residual = ((self.target_px - ray @ matrix[:2, :2].T - matrix[:2, 2]) * self.normal).sum(axis=1)
-        by_ray = self.normal * (matrix[[0, 1], [0, 1]] / depth)
+        residual = ((target_px - ray @ matrix[:2, :2].T - matrix[:2, 2]) * normal).sum(axis=1)
+        by_ray = normal * (matrix[[0, 1], [0, 1]] / depth)
         by_local = np.concatenate([by_ray, -(by_ray * ray).sum(axis=1, keepdims=True)], axis=1)
         return np.asarray(residual), np.asarray(by_local @ self._pose.rotation)
 
@@ -354,36 +398,48 @@ class _Line:
     """
 
     def __init__(
-        self, view: _View, radius_px: float, points_mm: Float, length_mm: Float, parameters: FitParameters
+        self,
+        view: _View,
+        streak: StreakObservation,
+        points_mm: Float,
+        length_mm: Float,
+        b: Float,
+        parameters: FitParameters,
     ) -> None:
-        self._view = view
-        at, along = length_mm[view.index], tangents(points_mm)[view.index]
+        self._view, self._offset_px = view, streak.offset_px
+        self._index = np.flatnonzero(np.isfinite(streak.sigma_px))
+        at, along = length_mm[self._index], tangents(points_mm)[self._index]
         slowly = parameters.streak_change_share**2 * _matern(np.abs(at[:, None] - at) / parameters.streak_mm)
-        turning = np.linalg.norm(along[:, None] - along, axis=2)
-        bending = parameters.streak_bend_share**2 * _matern(turning)
-        self._distance = radius_px**2 * (parameters.streak_share**2 + slowly + bending)
-        self._factor: Float | None = None
+        alike = along @ along.T
+        bending = parameters.streak_bend_share**2 * _matern(np.sqrt(np.maximum(2 - 2 * alike, 0.0)))
+        distance = streak.radius_px**2 * (parameters.streak_share**2 + slowly + bending)
         # Neighbouring sections blur into one another as those of the silhouette do.
-        self._variance = view.sigma_px**2 * max(1.0, parameters.correlation_mm * len(at) / max(np.ptp(length_mm), 1e-9))
+        variance = streak.sigma_px[self._index] ** 2 * max(
+            1.0, parameters.correlation_mm * len(at) / max(np.ptp(length_mm), 1e-9)
+        )
+        self._expected = distance + np.diag(variance)
+        residual, jacobian = view.linearized(points_mm, self._index, self._offset_px)
+        # What jumps off the line is not of it.
+        own = variance * np.linalg.solve(self._expected, residual)
+        jumping = variance * (1 + own**2 / (_ROBUST_SIGMAS**2 * variance))
+        rows = _rows(b[self._index], jacobian)
+        self._weighted = np.linalg.solve(distance + np.diag(jumping), rows).T
+        self._normal = self._weighted @ rows
 
     def misfit(self, points_mm: Float) -> float:
         """Mean squared offset left over about points (N, 3), in what was expected of a streak there."""
-        residual, _ = self._view.linearized(points_mm)
-        expected = self._distance + np.diag(self._variance)
-        return float(residual @ np.linalg.solve(expected, residual) / len(residual))
+        residual, _ = self._view.linearized(points_mm, self._index, self._offset_px)
+        return float(residual @ np.linalg.solve(self._expected, residual) / len(residual))
 
-    def whitened(self, points_mm: Float, b: Float) -> tuple[Float, Float]:
-        """Rows (K, 3M) and residuals (K,) of unit noise, linearised about points (N, 3); b (N, M) is their basis."""
-        residual, jacobian = self._view.linearized(points_mm)
-        if self._factor is None:
-            # What jumps off the line is not of it.
-            own = self._variance * np.linalg.solve(self._distance + np.diag(self._variance), residual)
-            variance = self._variance * (1 + own**2 / (_ROBUST_SIGMAS**2 * self._variance))
-            self._factor = np.asarray(np.linalg.cholesky(self._distance + np.diag(variance)), dtype=np.float64)
-        mixing = b[self._view.index]
-        rows = (mixing[:, :, None] * jacobian[:, None, :]).reshape(len(residual), -1)
-        white = solve_triangular(self._factor, np.column_stack([rows, residual]), lower=True, check_finite=False)
-        return white[:, :-1], white[:, -1]
+    def normal(self, points_mm: Float, b: Float, moved: Float) -> tuple[Float, Float]:
+        """Normal matrix (3M, 3M), and the pull (3M,) on the start of a curve that is now at points (N, 3)."""
+        residual, _ = self._view.linearized(points_mm, self._index, self._offset_px)
+        return self._normal, self._weighted @ residual + self._normal @ moved
+
+
+def _rows(mixing: Float, jacobian: Float) -> Float:
+    """Derivatives (K, 3M) by control points from those by points (K, 3), of which mixing (K, M) says the shares."""
+    return np.asarray((mixing[:, :, None] * jacobian[:, None, :]).reshape(len(mixing), -1))
 
 
 def _matern(apart: Float) -> Float:

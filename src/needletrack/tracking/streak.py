@@ -44,17 +44,19 @@ def find_streak(values: Float, half_widths: Float) -> Streak | None:
     half_widths (N,) of the needle there, units.
     """
     contrast = correlate1d(values, _line(), axis=1, mode="nearest")
-    inside = np.abs(OFFSETS) < _WITHIN_SHARE * half_widths[:, None]
-    worth = np.where(inside, np.clip(contrast, 0.0, _MOST_CONTRAST), -_MOST_CONTRAST)
-    at = np.clip(_brightest_path(worth), 1, len(OFFSETS) - 2)
+    within = np.abs(OFFSETS) < _WITHIN_SHARE * half_widths[:, None]
+    worth = np.where(within, np.clip(contrast, 0.0, _MOST_CONTRAST), -_MOST_CONTRAST)
+    ever = np.flatnonzero(within.any(axis=0))
+    if len(ever) == 0:
+        return None
+    at = np.clip(ever[_brightest_path(worth[:, ever])], 1, len(OFFSETS) - 2)
     rows = np.arange(len(at))
     for _ in range(2):
-        at = np.clip(
-            at + contrast[rows[:, None], at[:, None] + np.arange(-1, 2)].argmax(axis=1) - 1, 1, len(OFFSETS) - 2
-        )
+        beside = contrast[rows[:, None], at[:, None] + np.arange(-1, 2)]
+        at = np.clip(at + beside.argmax(axis=1) - 1, 1, len(OFFSETS) - 2)
     before, here, after = (contrast[rows, at + k] for k in (-1, 0, 1))
     bend = 2 * here - before - after
-    is_peak = (here >= before) & (here >= after) & (bend > 0) & inside[rows, at]
+    is_peak = (here >= before) & (here >= after) & (bend > 0) & within[rows, at]
     seen = is_peak & (here > _LEAST_CONTRAST)
     if seen.mean() < _LEAST_SHARE:
         return None
@@ -65,8 +67,9 @@ def find_streak(values: Float, half_widths: Float) -> Streak | None:
 
 
 def _brightest_path(worth: Float) -> Int:
-    """Indices (N,) of the path from end to end that is worth most; turning aside has its price (Viterbi 1967)."""
-    price = _TURN_PRICE * np.abs(OFFSETS[:, None] - OFFSETS)
+    """Columns (N,) of the path through (N, places) that is worth most; turning aside has its price (Viterbi 1967)."""
+    places = np.arange(worth.shape[1])
+    price = _TURN_PRICE * ACROSS_STEP * np.abs(places[:, None] - places)
     log = worth.copy()
     for i in range(1, len(log)):
         log[i] += (log[i - 1] - price).max(axis=1)

@@ -294,31 +294,32 @@ def _inside_pictures(
     return before, np.asarray(gaussian_filter1d(parts, along_mm / _PICTURE_MM, axis=1, mode="nearest"))
 
 
+def _apart(one: Float, other: Float, lag: int) -> float:
+    """Mean squared difference of two profiles, the other `lag` rows further on, where they overlap."""
+    ahead, behind = max(lag, 0), max(-lag, 0)
+    count = len(one) - abs(lag)
+    off = one[behind : behind + count] - other[ahead : ahead + count]
+    return float(off @ off) / count
+
+
 def _behind(gray: Float, reach: float) -> Float:
     """The background (rows, columns), behind the needle, to `reach` units either side, as it is beside it.
 
     What crosses there, a vessel say, crosses straight: profiles to either side are alike but for a shift along.
     """
     smooth = gaussian_filter(gray, (1.0, 0.7))
-    beside = np.abs(_ACROSS) > reach
+    # Of a needle that nearly fills the picture the outermost columns are taken.
+    beside = np.abs(_ACROSS) > min(reach, _ACROSS[-1] - 0.75)
     left, right = np.flatnonzero(beside & (_ACROSS < 0))[-1], np.flatnonzero(beside & (_ACROSS > 0))[0]
     share = np.clip((_ACROSS - _ACROSS[left]) / (_ACROSS[right] - _ACROSS[left]), 0.0, 1.0)
     rows = np.arange(len(gray), dtype=np.float64)
     one, other = smooth[:, left], smooth[:, right]
-    lags = np.arange(-_MOST_LAG, _MOST_LAG + 1)
-    apart = [
-        float(np.mean((np.interp(rows - lag / 2, rows, one) - np.interp(rows + lag / 2, rows, other)) ** 2))
-        + _LAG_PRICE * lag**2
-        for lag in lags
-    ]
-    lag = float(lags[int(np.argmin(apart))])
-    filled = np.column_stack(
-        [
-            np.interp(rows - lag * t, rows, one) * (1 - t) + np.interp(rows + lag * (1 - t), rows, other) * t
-            for t in share
-        ]
-    )
-    filled = np.where(beside, smooth, filled)
+    lag = min(range(-_MOST_LAG, _MOST_LAG + 1), key=lambda lag: _apart(one, other, lag) + _LAG_PRICE * lag**2)
+    filled = smooth.copy()
+    for column in np.flatnonzero(~beside):
+        t = share[column]
+        filled[:, column] = np.interp(rows - lag * t, rows, one) * (1 - t)
+        filled[:, column] += np.interp(rows + lag * (1 - t), rows, other) * t
     return np.asarray(filled - np.median(filled))
 
 

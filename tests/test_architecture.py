@@ -28,6 +28,7 @@ FLOORS: dict[str, float] = {
     "client": 3.5,
     "scoring": 3.5,
     "service": 4.0,
+    "guidance": 4.1,
     "watch": 4.1,
     "table1": 4.1,
     "api": 5.0,

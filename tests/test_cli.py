@@ -2,25 +2,22 @@
 
 import json
 import re
+import shutil
 import socket
 import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
-from datetime import datetime
 from pathlib import Path
 
 import pytest
 from rich.console import Group
-from tests.recording.small_recording import small_rig
 from typer.testing import CliRunner, Result
 
 import needletrack
-from needletrack.calibration.board import Checkerboard
 from needletrack.cli import app
 from needletrack.config import load_config
 from needletrack.publish.publisher import ZenohPublisher
 from needletrack.publish.schema import example_messages, example_run
-from needletrack.recording.board import BoardCalibration
 from needletrack.rig import find_rig, read_rig, write_rig
 
 RECORDINGS = Path(__file__).parent / "data" / "recordings"
@@ -105,22 +102,42 @@ def test_a_configuration_is_checked(tmp_path: Path) -> None:
     assert "did you mean tracking.needle.max_diameter_mm?" in refused("config", "check", config)
 
 
-def test_calibrate_writes_what_the_board_gave(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    given: list[object] = []
-
-    def calibrated(folder: Path, board: Checkerboard, name: str, calibrated_at: datetime) -> BoardCalibration:
-        given.extend((folder, board, name, calibrated_at.tzinfo is not None))
-        return BoardCalibration(small_rig(), ("1.png: the board was not found",), 0.125)
-
-    monkeypatch.setattr("needletrack.recording.board.calibrate_from_recording", calibrated)
+def test_calibrate_writes_the_rig_and_the_report(tmp_path: Path) -> None:
+    folder = tmp_path / "bench 2"
+    shutil.copytree(RECORDINGS / "calib-b", folder)
+    broken = min((folder / "cam1" / "data").glob("*.png"))
+    broken.write_bytes(broken.read_bytes()[:-20])
     output = tmp_path / "rig.yaml"
-    board = RECORDINGS / "calib-b"
-    result = run("calibrate", board, "--square-mm", 10, "--squares", "12x9", "--output", output)
+    result = run("calibrate", folder, "--square-mm", 10, "--squares", "12x9", "--output", output)
     assert result.exit_code == 0, result.stderr
-    assert given == [board, Checkerboard(12, 9, 10.0), "calib-b", True]
-    assert read_rig(output).digest == small_rig().digest
-    assert result.stderr == "left out: 1.png: the board was not found\n"
-    assert "worst view 0.125 px rms" in result.stdout
+    rig = read_rig(output)
+    assert rig.name == "bench-2"
+    assert rig.calibration.views == 7
+    stated = rig.calibration.uncertainty
+    assert stated is not None
+    assert stated.after_alignment_mm is not None
+    assert 0 < stated.after_alignment_mm < 0.05
+    assert result.stderr.startswith("left out: ")
+    assert str(broken) in result.stderr
+    for expected in ("7 used, 1 left out", "held out", "mm rms to expect in the workspace", "take 5 more views"):
+        assert expected in result.stdout
+    page = (tmp_path / "rig-calibration.html").read_text()
+    assert "Calibration of bench-2" in page
+    assert "http" not in page.replace("http-equiv", "")
+
+
+def test_two_folders_of_pictures_pair_by_their_numbers(tmp_path: Path) -> None:
+    for camera, side in (("cam0", "left"), ("cam1", "right")):
+        (tmp_path / side).mkdir()
+        for index, file in enumerate(sorted((RECORDINGS / "calib-b" / camera / "data").glob("*.png"))):
+            shutil.copy(file, tmp_path / side / f"{side}{index:02}.png")
+    output = tmp_path / "rig.yaml"
+    given = ("--square-mm", 10, "--squares", "12x9", "--output", output, "--name", "pair")
+    assert run("calibrate", tmp_path / "left", tmp_path / "right", *given).exit_code == 0
+    assert read_rig(output).calibration.views == 8
+    (tmp_path / "empty").mkdir()
+    told = refused("calibrate", tmp_path / "left", tmp_path / "empty", "--square-mm", 10)
+    assert "no two pictures pair" in told
 
 
 @pytest.mark.parametrize("squares", ["11", "11x", "11x11x11", "axb", "-1x5"])

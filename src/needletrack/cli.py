@@ -5,6 +5,7 @@ be used, with one line on stderr that says what and the remedy; 130 after Ctrl-C
 """
 
 import os
+import re
 from collections.abc import Callable
 from datetime import UTC, datetime
 from functools import wraps
@@ -21,6 +22,8 @@ from needletrack.publish.keys import DEFAULT_PREFIX
 from needletrack.publish.session import DEFAULT_ENDPOINT
 
 if TYPE_CHECKING:
+    from needletrack.calibration.board import Board
+    from needletrack.calibration.bundle import Terms
     from needletrack.rig import Rig
 
 # What loads NumPy, SciPy and OpenCV is imported by the commands themselves: they read these variables when
@@ -30,6 +33,7 @@ for _variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "OPENCV_FOR_THREADS
 
 LAB_RECORDING = Path("tests/data/recordings/lab-a")
 _TABLE_WIDTH = 160
+_TERMS: "dict[str, Terms]" = {"4": 4, "5": 5, "8": 8}
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -293,25 +297,77 @@ def config_check(path: Annotated[Path, typer.Argument(metavar="PATH", help="TOML
 @app.command()
 @plain_errors
 def calibrate(
-    recording: Annotated[Path, typer.Argument(metavar="RECORDING", help="Recording of the board: ten views or more.")],
-    square_mm: Annotated[float, typer.Option(help="Side of a square, mm.")],
+    folder: Annotated[
+        Path,
+        typer.Argument(
+            metavar="FOLDER", help="Recording of the board, or the left camera's pictures; ten views or more."
+        ),
+    ],
+    right: Annotated[
+        Path | None,
+        typer.Argument(metavar="RIGHT", help="The right camera's pictures, where FOLDER has the left ones."),
+    ] = None,
+    *,
+    square_mm: Annotated[float, typer.Option(help="Side of a square, mm: measure it.")],
     squares: Annotated[str, typer.Option(help="Squares across and down.")] = "11x11",
+    marker_mm: Annotated[float | None, typer.Option(help="Side of a marker, mm: the board is a ChArUco board.")] = None,
+    dictionary: Annotated[str, typer.Option(help="Dictionary of the ChArUco board's markers.")] = "DICT_5X5_1000",
+    legacy: Annotated[bool, typer.Option("--legacy", help="ChArUco board as OpenCV drew it before 4.6.")] = False,
     output: Annotated[Path, typer.Option(help="The rig file to write.")] = Path("rig.yaml"),
-    name: Annotated[str | None, typer.Option(help="The rig's name; else the recording's.")] = None,
+    report: Annotated[Path | None, typer.Option(help="The HTML report; else beside the rig file.")] = None,
+    name: Annotated[str | None, typer.Option(help="The rig's name; else the folder's.")] = None,
+    lens: Annotated[
+        Literal["auto", "4", "5", "8"],
+        typer.Option(help="Terms of the distortion: 4 or 5 radial-tangential, 8 rational; auto: what the views carry."),
+    ] = "auto",
+    warp: Annotated[bool, typer.Option("--warp", help="Solve for the board's bend as well.")] = False,
+    config: ConfigFile = None,
+    stream: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="RECORDING",
+            help="With guidance: take the views that add something from a stream into FOLDER, a new one, then "
+            "calibrate. The stream is a recording, played at its own pace.",
+        ),
+    ] = None,
 ) -> None:
-    """Make a rig file from a recording of a checkerboard."""
-    from needletrack.calibration.board import Checkerboard
-    from needletrack.recording.board import calibrate_from_recording
+    """Make a rig file from pictures of a checkerboard or a ChArUco board, and a report of what it is worth."""
+    from needletrack.config import load_config
+    from needletrack.recording.board import calibrate_from_pictures, open_board_pictures
+    from needletrack.report.calibration import write_calibration_report
     from needletrack.rig import write_rig
+    from needletrack.terminal import Interruption, steps_shown
 
-    across, down = _parsed(squares)
-    board = Checkerboard(across, down, square_mm)
-    found = calibrate_from_recording(recording, board, name or recording.resolve().name, datetime.now(UTC))
+    board = _board(squares, square_mm, marker_mm, dictionary, legacy=legacy)
+    workspace = load_config(config).tracking.workspace
+    console = Console(stderr=True)
+    if stream is not None:
+        from needletrack.guidance import GuidanceShown, collect
+        from needletrack.recording.board import BoardRecorder, board_stream
+
+        with Interruption() as interruption, GuidanceShown(console) as shown:
+            collect(board_stream(stream), board, BoardRecorder(folder), interruption.stop, shown.take)
+    pictures = open_board_pictures(folder, right)
+    with steps_shown(console, "looking for the board", len(pictures.names)) as progress:
+        found = calibrate_from_pictures(
+            pictures,
+            board,
+            name or _rig_name(folder),
+            datetime.now(UTC),
+            lens=None if lens == "auto" else _TERMS[lens],
+            warp=warp,
+            workspace=workspace,
+            progress=progress,
+        )
     write_rig(found.rig, output)
+    page = report or output.with_name(f"{output.stem}-calibration.html")
+    write_calibration_report(found, pictures, board, page)
     for sentence in found.left_out:
         typer.echo(f"left out: {sentence}", err=True)
     _show_rig(found.rig)
-    typer.echo(f"worst view {found.worst_view_rms_px:.3f} px rms; written: {output}")
+    for line in found.told():
+        typer.echo(line)
+    typer.echo(f"written: {output}, {page}")
 
 
 @app.command()
@@ -338,6 +394,19 @@ def version() -> None:
 
 def _complain(error: Exception) -> None:
     typer.echo(f"needletrack: {error}", err=True)
+
+
+def _board(squares: str, square_mm: float, marker_mm: float | None, dictionary: str, *, legacy: bool) -> "Board":
+    from needletrack.calibration.board import CharucoBoard, Checkerboard
+
+    across, down = _parsed(squares)
+    if marker_mm is None:
+        return Checkerboard(across, down, square_mm)
+    return CharucoBoard(across, down, square_mm, marker_mm, dictionary, legacy)
+
+
+def _rig_name(folder: Path) -> str:
+    return re.sub(r"[^A-Za-z0-9._-]+", "-", folder.resolve().name).strip("-._") or "rig"
 
 
 def _parsed(squares: str) -> tuple[int, int]:

@@ -13,7 +13,7 @@ BOARD = Checkerboard(12, 9, 5.0)
 
 
 def view(rig: StereoRig, x: float, y: float, z: float, right_nearer_deg: float, bottom_nearer_deg: float) -> BoardView:
-    # A positive turn about y takes the right side away; about x it brings the bottom... away as well.
+    # A positive turn about y brings the right side nearer, a positive one about x takes the bottom away.
     turn = Rotation.from_euler("yx", [right_nearer_deg, -bottom_nearer_deg], degrees=True).as_matrix()
     pose = RigidTransform(turn, np.array([x, y, z]) - turn @ BOARD.points_mm.mean(axis=0))
     return BoardView(*rig.project(pose.apply(BOARD.points_mm)))

@@ -7,6 +7,7 @@ parameters, the pixels held, follows from the implicit function theorem (Hartley
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import cv2
 import numpy as np
@@ -137,17 +138,21 @@ class RigUncertainty:
             raise ValueError("the calibration's covariance has a negative variance")
         object.__setattr__(self, "covariance", covariance)
 
+    @cached_property
+    def _motion(self) -> Float | None:
+        """The rigid motion (6, P) that the reference points take part in, by the parameters."""
+        if self.reference_mm is None:
+            return None
+        there, _ = point_derivatives(self.rig, self.reference_mm)
+        motions = rigid_motions(self.reference_mm).reshape(-1, 6)
+        return np.asarray(np.linalg.lstsq(motions, there.reshape(-1, there.shape[2]), rcond=None)[0])
+
     def derivatives(self, points_mm: Float) -> Float:
         """Derivatives (N, 3, P) of triangulated points (N, 3) mm, left camera's frame, by the parameters."""
         by_parameters, _ = point_derivatives(self.rig, points_mm)
-        if self.reference_mm is None:
+        if self._motion is None:
             return by_parameters
-        there, _ = point_derivatives(self.rig, self.reference_mm)
-        count = there.shape[2]
-        motion = np.linalg.lstsq(rigid_motions(self.reference_mm).reshape(-1, 6), there.reshape(-1, count), rcond=None)[
-            0
-        ]
-        return np.asarray(by_parameters - rigid_motions(np.asarray(points_mm)) @ motion)
+        return np.asarray(by_parameters - rigid_motions(np.asarray(points_mm)) @ self._motion)
 
     def covariance_mm2(self, points_mm: Float) -> Float:
         """Covariance (N, 3, 3) of triangulated points (N, 3) mm that the calibration alone gives them."""

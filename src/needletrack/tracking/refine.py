@@ -97,6 +97,7 @@ class Refined:
     tip_is_free: bool
     tip_px: Float
     log_odds: float
+    calibration_mm2: Float | None = None
 
     @property
     def tip_covariance_mm2(self) -> Float:
@@ -105,6 +106,8 @@ class Refined:
         left, right = self.tip.each_mm
         along_mm = np.hypot(np.sum(np.array(self.tip.sigma_mm) ** -2.0) ** -0.5, abs(left - right) / 2)
         covariance = self.fit.point_covariance_mm2()[-1] + along_mm**2 * np.outer(along, along)
+        if self.calibration_mm2 is not None:
+            covariance = covariance + self.calibration_mm2[-1]
         return np.asarray((covariance + covariance.T) / 2)
 
 

@@ -20,6 +20,7 @@ FLOORS: dict[str, float] = {
     "synthetic": 2.0,
     "validation": 3.0,
     "rig": 3.1,
+    "formats": 3.15,
     "config": 3.2,
     "capture": 3.3,
     "publish": 3.4,

@@ -249,17 +249,47 @@ def rig_show(path: RigPath) -> None:
 @rig_app.command("import")
 @plain_errors
 def rig_import(
-    camchain: Annotated[Path, typer.Argument(metavar="CAMCHAIN", help="Kalibr's camchain.yaml.")],
+    files: Annotated[
+        list[Path],
+        typer.Argument(
+            metavar="FILE...",
+            help="Kalibr camchain, OpenCV FileStorage (one or two files), MATLAB .mat; or the left and the right "
+            "camera's ROS camera_info or mrcal .cameramodel.",
+        ),
+    ],
     output: Annotated[Path, typer.Option(help="The rig file to write.")] = Path("rig.yaml"),
     name: Annotated[str | None, typer.Option(help="The rig's name; else its folder's.")] = None,
+    size: Annotated[str | None, typer.Option(help="Of the images, e.g. 1280x1024, where no file says it.")] = None,
+    unit_mm: Annotated[
+        float | None, typer.Option(help="Millimetres in the files' unit of length, where it is not the usual one.")
+    ] = None,
 ) -> None:
-    """Make a rig file from a Kalibr camchain."""
-    from needletrack.rig import import_camchain, write_rig
+    """Make a rig file from another tool's calibration."""
+    from needletrack.formats.exchange import import_rig
+    from needletrack.rig import write_rig
 
-    imported = import_camchain(camchain, name)
+    size_px = None if size is None else _numbers(size, "--size", "1280x1024, width and height")
+    imported = import_rig(files, name or _rig_name(files[0].resolve().parent), size_px=size_px, unit_mm=unit_mm)
     write_rig(imported, output)
     _show_rig(imported)
     typer.echo(f"written: {output}")
+
+
+@rig_app.command("export")
+@plain_errors
+def rig_export(
+    path: RigPath,
+    output: Annotated[Path, typer.Argument(metavar="OUTPUT", help="The file to write; the folder for ros and mrcal.")],
+    kind: Annotated[
+        Literal["kalibr", "ros", "opencv", "matlab", "mrcal"], typer.Option("--format", help="Whose format.")
+    ],
+) -> None:
+    """Write a rig in another tool's format."""
+    from needletrack.formats.exchange import export_rig
+    from needletrack.replay import rig_at
+
+    for written in export_rig(rig_at(path), kind, output):
+        typer.echo(f"written: {written}")
 
 
 @rig_app.command("check")
@@ -410,9 +440,13 @@ def _rig_name(folder: Path) -> str:
 
 
 def _parsed(squares: str) -> tuple[int, int]:
-    across, _, down = squares.lower().partition("x")
+    return _numbers(squares, "--squares", "11x11, squares across and down")
+
+
+def _numbers(text: str, option: str, wanted: str) -> tuple[int, int]:
+    across, _, down = text.lower().partition("x")
     if not (across.isdecimal() and down.isdecimal()):
-        raise CalibrationError(f"--squares {squares!r}: write it as 11x11, squares across and down")
+        raise CalibrationError(f"{option} {text!r}: write it as {wanted}")
     return int(across), int(down)
 
 

@@ -300,7 +300,10 @@ def rig_check(path: RigPath, config: ConfigFile = None) -> None:
     from needletrack.replay import rig_at
 
     checked = rig_at(path)
-    checked.require_view_of(load_config(config).tracking.workspace)
+    settings = load_config(config)
+    checked.require_view_of(settings.tracking.workspace)
+    if warning := checked.age_warning(settings.rig.max_age_days, datetime.now(UTC)):
+        typer.echo(f"warning: {warning}", err=True)
     typer.echo(f"{path}: ok, rig {checked.name}, digest {checked.digest}")
 
 
@@ -402,6 +405,78 @@ def calibrate(
 
 @app.command()
 @plain_errors
+def check(
+    rig: Annotated[Path, typer.Argument(metavar="RIG", help="Rig file.")],
+    folder: Annotated[
+        Path,
+        typer.Argument(metavar="FOLDER", help="One fresh pair of pictures of the board, or more, as for calibrate."),
+    ],
+    right: Annotated[Path | None, typer.Argument(metavar="RIGHT", help="As for calibrate.")] = None,
+    *,
+    square_mm: Annotated[float, typer.Option(help="Side of a square, mm.")],
+    squares: Annotated[str, typer.Option(help="Squares across and down.")] = "11x11",
+    marker_mm: Annotated[float | None, typer.Option(help="Side of a marker, mm, of a ChArUco board.")] = None,
+    dictionary: Annotated[str, typer.Option(help="Dictionary of its markers.")] = "DICT_5X5_1000",
+    legacy: Annotated[bool, typer.Option("--legacy", help="ChArUco board as OpenCV drew it before 4.6.")] = False,
+    config: ConfigFile = None,
+) -> None:
+    """Check with a fresh picture pair of a board whether the cameras still stand as they were calibrated.
+
+    Exit code 0 where they do; 1 where one has moved: calibrate anew, nothing is corrected in silence.
+    """
+    from needletrack.config import load_config
+    from needletrack.recording.board import check_pictures, open_board_pictures
+    from needletrack.replay import rig_at
+
+    checked, settings = rig_at(rig), load_config(config)
+    board = _board(squares, square_mm, marker_mm, dictionary, legacy=legacy)
+    if warning := checked.age_warning(settings.rig.max_age_days, datetime.now(UTC)):
+        typer.echo(f"warning: {warning}", err=True)
+    found = check_pictures(checked, open_board_pictures(folder, right), board, settings.tracking.workspace)
+    for line in found.told():
+        typer.echo(line)
+    if found.check.moved:
+        raise typer.Exit(1)
+
+
+@app.command()
+@plain_errors
+def register(
+    rig: Annotated[Path, typer.Argument(metavar="RIG", help="Rig file.")],
+    pairs: Annotated[
+        Path,
+        typer.Argument(
+            metavar="PAIRS",
+            help="CSV with rig_x_mm, rig_y_mm, rig_z_mm, robot_x_mm, robot_y_mm, robot_z_mm; robot_qx ... robot_qw "
+            "as well where the robot states its flange, and the rig saw the tip of its tool.",
+        ),
+    ],
+    frame_id: Annotated[str, typer.Option(help="The robot's frame, in which tracks are then published.")],
+    output: Annotated[Path | None, typer.Option(help="The rig file to write; else RIG itself.")] = None,
+) -> None:
+    """Find where the rig stands in a robot's frame; tracks are then published in that frame."""
+    from needletrack.recording.registration import read_pairs, registered
+    from needletrack.rig import read_rig, write_rig
+
+    placed, found = registered(read_rig(rig), read_pairs(pairs), frame_id, datetime.now(UTC))
+    write_rig(placed, output or rig)
+    for index, (residual, without) in enumerate(
+        zip(found.residual_mm.tolist(), found.leave_one_out_mm.tolist(), strict=True), start=1
+    ):
+        typer.echo(f"pair {index:3}    {residual:8.3f} mm off, {without:8.3f} mm by the others alone")
+    typer.echo(f"all         {found.rms_mm:8.3f} mm rms, {found.leave_one_out_rms_mm:8.3f} mm by the others alone")
+    if found.tool_mm is not None:
+        typer.echo(
+            f"tool        tip at {', '.join(f'{value:.3f}' for value in found.tool_mm.tolist())} mm in the flange"
+        )
+    turn = " ".join(f"{value:.3f}" for value in found.turn_sigma_deg.tolist())
+    shift = " ".join(f"{value:.3f}" for value in found.shift_sigma_mm.tolist())
+    typer.echo(f"sigma       turn {turn} degrees, shift {shift} mm, about the robot's axes through the points' middle")
+    typer.echo(f"written: {output or rig}; tracks are published in {frame_id}")
+
+
+@app.command()
+@plain_errors
 def table1(
     recording: Annotated[Path, typer.Argument(metavar="RECORDING", help="Recording of stills.")] = LAB_RECORDING,
     repeats: Annotated[int, typer.Option(min=1, help="Runs of each stage; the median counts.")] = 9,
@@ -469,3 +544,11 @@ def _show_rig(rig: "Rig") -> None:
     if info.views is not None:
         facts.append(f"{info.views} views")
     typer.echo(f"calibrated  {', '.join([*facts, info.source] if info.source else facts)}")
+    stated = info.uncertainty
+    if stated is not None and stated.before_alignment_mm is not None and stated.after_alignment_mm is not None:
+        typer.echo(
+            f"to expect   {stated.before_alignment_mm:.3f} mm rms in the workspace, {stated.after_alignment_mm:.3f} mm "
+            "after the best rigid alignment"
+        )
+    if (placed := rig.registration) is not None:
+        typer.echo(f"registered  to {placed.frame_id}, {len(placed.points_mm)} points, {placed.rms_mm:.3f} mm rms")

@@ -251,6 +251,16 @@ class Rig(StereoRig):
         """The frame in which tracks are published: the robot's where the rig is registered."""
         return f"{self.name}_left" if self.registration is None else self.registration.frame_id
 
+    def age_warning(self, max_age_days: float, now: datetime) -> str | None:
+        """A sentence where the calibration is older than that; None where it is not, or its date is unknown."""
+        age = self.age_days(now)
+        if age is None or age <= max_age_days:
+            return None
+        return (
+            f"rig {self.name} was calibrated {age:.0f} days ago, more than {max_age_days:g} (rig.max_age_days): run "
+            "`needletrack check` with a board, or calibrate anew"
+        )
+
     def age_days(self, now: datetime) -> float | None:
         """Days since the calibration; None where its date is unknown."""
         at = self.calibration.calibrated_at

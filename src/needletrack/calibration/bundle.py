@@ -124,6 +124,109 @@ def adjust(
 
 
 @dataclass(frozen=True, slots=True)
+class Refit:
+    """A calibrated rig fitted again to few views: cost is minus twice the log posterior.
+
+    sigma_px: of one coordinate of a corner, from these views' residuals. bump (6,): turn (rad) and shift (mm) of the
+    right camera since the calibration, as in its parameters, with its covariance (6, 6); zero where none is allowed.
+    """
+
+    rig: StereoRig
+    cost: float
+    sigma_px: float
+    bump: Float
+    bump_covariance: Float
+
+
+def refit(
+    rig: StereoRig,
+    covariance: Float | None,
+    views: Sequence[BoardView],
+    board: Board,
+    sigma_px: float,
+    *,
+    bump: tuple[float, float] | None = None,
+) -> Refit:
+    """The rig that its calibration, of that covariance (P, P), and fresh views of a board agree on.
+
+    bump: standard deviations, in degrees and mm, by which the right camera may have moved since. sigma_px: noise of the
+    corners. Raises CalibrationError where the views fit no board.
+    """
+    size = parameter_count(rig)
+    known = np.zeros((size, size)) if covariance is None else covariance.copy()
+    # A calibration without a stated covariance counts as exact but for rounding.
+    known[np.diag_indices(size)] += (1e-9 * np.maximum(1.0, _scales(rig))) ** 2
+    allowed = np.zeros(6) if bump is None else np.repeat([np.radians(bump[0]) ** 2, bump[1] ** 2], 3)
+    known[range(-6, 0), range(-6, 0)] += allowed
+    precision = _inverse(known)
+    prior = _Prior(rig, precision)
+    problem = _Problem(views, board, rig, prior)
+    poses = []
+    for view in views:
+        assert view.left_px is not None
+        seen = np.isfinite(view.left_px).all(axis=1)
+        is_found, turn, shift = cv2.solvePnP(
+            np.ascontiguousarray(board.points_mm[seen]), view.left_px[seen], rig.left.matrix, rig.left.distortion
+        )
+        if not is_found:
+            raise CalibrationError("a view fits no board: check the number of squares and their side in mm")
+        poses.append(RigidTransform(orthonormalized(cv2.Rodrigues(turn)[0]), np.ravel(shift)))
+    state = _State(
+        rig,
+        np.array([pose.rotation for pose in poses]),
+        np.array([pose.translation_mm for pose in poses]),
+        np.zeros(0),
+    )
+    state, left_over = _minimized(problem, state, problem.seen, sigma_px)
+    squares = float((left_over[problem.seen] ** 2).sum())
+    degrees = 2 * int(problem.seen.sum()) - 6 * len(views)
+    # The camera's motion is a part of the change of its pose; the rest belongs to the calibration's own uncertainty.
+    gain = allowed[:, None] * precision[-6:]
+    found = _inverse(problem.normal(state, problem.seen, sigma_px).reduced())
+    left_open = np.diag(allowed) - gain[:, -6:] * allowed
+    return Refit(
+        state.rig,
+        problem.cost(state, problem.seen, sigma_px),
+        float(np.sqrt(squares / max(degrees, 1))),
+        gain @ prior.change(state.rig),
+        left_open + gain @ found @ gain.T,
+    )
+
+
+def _scales(rig: StereoRig) -> Float:
+    """The order of magnitude (P,) of each parameter."""
+    parts = []
+    for camera in (rig.left, rig.right):
+        parts += [np.full(4, camera.focal_px), np.ones(len(camera.distortion))]
+    return np.concatenate([*parts, np.ones(3), np.full(3, rig.baseline_mm)])
+
+
+class _Prior:
+    """A calibration: the rig, and the precision (P, P) of its parameters."""
+
+    def __init__(self, rig: StereoRig, precision: Float) -> None:
+        self._rig = rig
+        scale = np.sqrt(np.diag(precision))
+        self._root = np.linalg.cholesky(precision / np.outer(scale, scale)).T * scale
+
+    def known(self, rig: StereoRig) -> tuple[Float, Float]:
+        return self._root, -self._root @ self.change(rig)
+
+    def change(self, rig: StereoRig) -> Float:
+        """By which parameters (P,) a rig differs from the calibrated one."""
+        parts = []
+        for camera, before in ((rig.left, self._rig.left), (rig.right, self._rig.right)):
+            change = (camera.matrix - before.matrix)[[0, 1, 0, 1], [0, 1, 2, 2]]
+            parts += [change, camera.distortion - before.distortion]
+        pose, before_pose = rig.right_from_left, self._rig.right_from_left
+        parts += [
+            Rotation.from_matrix(pose.rotation @ before_pose.rotation.T).as_rotvec(),
+            pose.translation_mm - before_pose.translation_mm,
+        ]
+        return np.concatenate(parts)
+
+
+@dataclass(frozen=True, slots=True)
 class _State:
     """Where the search stands: board_turns (V, 3, 3) and board_shifts (V, 3) are left_from_board."""
 
@@ -218,7 +321,10 @@ def _scaled_solve(matrix: Float, right: Float) -> Float:
 class _Problem:
     """The corners of all views, and what they say at a state."""
 
-    def __init__(self, views: Sequence[BoardView], board: Board, start: StereoRig) -> None:
+    def __init__(
+        self, views: Sequence[BoardView], board: Board, start: StereoRig, prior: "_Prior | None" = None
+    ) -> None:
+        self.prior = prior
         nothing = np.full((len(board.points_mm), 2), np.nan)
         self.corners = np.array(
             [[nothing if px is None else px for px in (view.left_px, view.right_px)] for view in views]
@@ -236,6 +342,8 @@ class _Problem:
 
     def known(self, state: _State) -> tuple[Float, Float]:
         """What is known before any picture: derivatives (K, P) and what is missing (K,), in standard deviations."""
+        if self.prior is not None:
+            return self.prior.known(state.rig)
         size = parameter_count(state.rig) + len(state.warp)
         rows, missing = [], []
         at = 0
@@ -339,10 +447,12 @@ def _lens_sigma(term: int, corner: float) -> float:
     return float(_RADIAL / corner**power)
 
 
-def _minimized(problem: _Problem, state: _State, used: npt.NDArray[np.bool_]) -> tuple[_State, Float]:
-    """Levenberg-Marquardt; the corners' sigma, against which the prior weighs, is found on the way."""
+def _minimized(
+    problem: _Problem, state: _State, used: npt.NDArray[np.bool_], stated: float | None = None
+) -> tuple[_State, Float]:
+    """Levenberg-Marquardt; the corners' sigma, against which the prior weighs, is stated or found on the way."""
     damping = 1e-4
-    sigma = max(float(np.sqrt((problem.residual(state)[used] ** 2).mean())), 1e-6)
+    sigma = stated or max(float(np.sqrt((problem.residual(state)[used] ** 2).mean())), 1e-6)
     for _ in range(_MOST_ROUNDS):
         try:
             normal = problem.normal(state, used, sigma)
@@ -359,7 +469,7 @@ def _minimized(problem: _Problem, state: _State, used: npt.NDArray[np.bool_]) ->
         except (np.linalg.LinAlgError, cv2.error) as error:
             raise CalibrationError("the views do not determine the cameras") from error
         state, damping = ahead, max(damping / 10, 1e-12)
-        now = max(float(np.sqrt((problem.residual(state)[used] ** 2).mean())), 1e-6)
+        now = stated or max(float(np.sqrt((problem.residual(state)[used] ** 2).mean())), 1e-6)
         settled = gained < _SETTLED * max(cost, 1.0) and abs(now - sigma) < 1e-6 * sigma
         sigma = now
         if settled:

@@ -110,7 +110,7 @@ def held_out(calibration: StereoCalibration, board: Board) -> HeldOut:
             warp=calibration.bundle.warp_mm is not None,
         ).rig
         for view in views[fold::folds]:
-            epipolar_px, lengths = _judged(rig, view, board)
+            epipolar_px, lengths = judged(rig, view, board)
             off_px.append(epipolar_px)
             off_mm.append(lengths[:, 0] - lengths[:, 1])
             longest = max(longest, float(lengths[:, 1].max(initial=0.0)))
@@ -144,7 +144,7 @@ def improvements(calibration: StereoCalibration, board: Board, points_mm: Float)
     return tuple(sorted(found, key=lambda each: each.expected.before_mm))
 
 
-def _judged(rig: StereoRig, view: BoardView, board: Board) -> tuple[Float, Float]:
+def judged(rig: StereoRig, view: BoardView, board: Board) -> tuple[Float, Float]:
     """Distances (N,) px from epipolar lines, and lengths (M, 2) mm, triangulated and true."""
     assert view.left_px is not None
     assert view.right_px is not None

@@ -16,6 +16,7 @@ import numpy as np
 from needletrack.calibration.board import Board, BoardView, CharucoBoard, find_board
 from needletrack.calibration.bundle import Terms
 from needletrack.calibration.coverage import Coverage, coverage
+from needletrack.calibration.drift import BoardCheck, check_views
 from needletrack.calibration.stereo import StereoCalibration, calibrate_stereo
 from needletrack.calibration.worth import (
     Expected,
@@ -229,6 +230,72 @@ def calibrate_from_pictures(
         improvements(solved, board, points_mm),
         points_mm,
     )
+
+
+@dataclass(frozen=True, slots=True)
+class RigCheck:
+    """What fresh pictures of the board say about a rig; left_out: a sentence for each pair that could not serve."""
+
+    check: BoardCheck
+    left_out: tuple[str, ...]
+
+    def told(self) -> tuple[str, ...]:
+        """The verdict and what it rests on, in a few lines for a person."""
+        found, caused = self.check, self.check.effect.error
+        lines = [("left out", sentence) for sentence in self.left_out]
+        lines += [
+            ("views", f"{found.views} of the board"),
+            (
+                "epipolar",
+                f"{found.epipolar_rms_px:.3f} px rms off the lines, {found.epipolar_mean_px:+.3f} px on average",
+            ),
+            ("lengths", f"{100 * found.length_error:+.3f} % on the board"),
+        ]
+        names = ("pitch", "yaw", "roll")
+        turn = zip(names, found.motion.turn_deg.tolist(), found.motion_sigma.turn_deg.tolist(), strict=True)
+        shift = zip("xyz", found.motion.shift_mm.tolist(), found.motion_sigma.shift_mm.tolist(), strict=True)
+        lines += [
+            ("turned", ", ".join(f"{name} {value:+.3f} ± {sigma:.3f}°" for name, value, sigma in turn)),
+            ("shifted", ", ".join(f"{name} {value:+.3f} ± {sigma:.3f} mm" for name, value, sigma in shift)),
+        ]
+        verdict = ("ok", "the right camera stands where it was calibrated, as far as these views tell")
+        if found.moved:
+            error = f"{caused.before_mm:.2f} mm rms off in the workspace, {caused.after_mm:.2f} mm in shape"
+            verdict = ("MOVED", f"tracks are {error}: calibrate anew")
+        lines.append(verdict)
+        return tuple(f"{name:12}{text}" for name, text in lines)
+
+
+def check_pictures(rig: Rig, pictures: BoardPictures, board: Board, workspace: Workspace | None = None) -> RigCheck:
+    """Judge a rig by fresh pictures of a board, by `check_views`.
+
+    Raises CalibrationError where the pictures have another size than the rig's, or none shows the board to both.
+    """
+    if pictures.size_px != rig.left.size_px:
+        raise CalibrationError(f"the pictures are {pictures.size_px}, the rig says {rig.left.size_px}")
+    left_out, views = [], []
+    for index, found in _found(pictures, board, lambda done: None):
+        if isinstance(found, RecordingError):
+            left_out.append(str(found))
+        elif found.left_px is None or found.right_px is None:
+            without = [side for side, px in (("left", found.left_px), ("right", found.right_px)) if px is None]
+            left_out.append(
+                f"{pictures.names[index]}: the board was not found in the {' and the '.join(without)} picture"
+            )
+        else:
+            views.append(found)
+    wanted = workspace or Workspace()
+    ranges = [(axis.min, axis.max) for axis in (wanted.x_mm, wanted.y_mm, wanted.z_mm)]
+    stated = rig.calibration.uncertainty
+    checked = check_views(
+        rig,
+        None if stated is None else stated.matrix,
+        None if stated is None else stated.corner_sigma_px,
+        views,
+        board,
+        space_grid_mm(rig, ranges[0], ranges[1], ranges[2]),
+    )
+    return RigCheck(checked, tuple(left_out))
 
 
 def described(board: Board) -> str:

@@ -116,7 +116,7 @@ def as_track(
         since_detection,
         shape.quality,
         elapsed_ms,
-        replace(evidence, axis_residual_px=fit.residual_px),
+        replace(evidence, axis_residual_px=fit.residual_px, tip_px=None if tip is None else shape.refined.tip_px),
         shape.doubts,
     )
 

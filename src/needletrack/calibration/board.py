@@ -268,8 +268,12 @@ def _fitted(image: Image, rough_px: Float, along: Float, down: Float, clear: flo
 
 
 def _detected(image: Image, inner_corners: tuple[int, int]) -> Float | None:
-    found, corners = cv2.findChessboardCornersSB(image, inner_corners, flags=0)
-    if not found:
+    # Photographs with a bright background are found with their grey levels evened out, dim ones as they are.
+    for flags in (cv2.CALIB_CB_NORMALIZE_IMAGE, 0):
+        found, corners = cv2.findChessboardCornersSB(image, inner_corners, flags=flags)
+        if found:
+            break
+    else:
         return None
     columns, rows = inner_corners
     grid = np.asarray(corners, dtype=np.float64).reshape(rows, columns, 2)

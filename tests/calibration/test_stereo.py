@@ -319,3 +319,26 @@ def in_left_order(view: BoardView, board: Checkerboard, true_rig: StereoRig) -> 
 
     order = min((turn.order for turn in board.turns), key=lambda order: distance_px(right_px[order]))
     return view.right_px[order]
+
+
+def test_a_bent_board_is_found_to_be_bent() -> None:
+    rig = default_rig()
+    board = Checkerboard(12, 9, 8.0)
+    middle = board.points_mm.mean(axis=0)
+    half = np.ptp(board.points_mm, axis=0)[:2] / 2
+    bulge = 1 - ((board.points_mm[:, :2] - middle[:2]) / half) ** 2
+    bent_mm = board.points_mm + np.array([0.0, 0.0, 1.0]) * (bulge @ np.array([0.3, -0.1]))[:, None]
+    random = np.random.default_rng(2)
+    views = []
+    for pose in board_poses(12, seed=5):
+        at = RigidTransform(pose.rotation, pose.apply(PAPER.points_mm.mean(axis=0)) - pose.rotation @ middle)
+        pixels = rig.project(at.apply(bent_mm))
+        left_px, right_px = (px + random.normal(0, 0.02, px.shape) for px in pixels)
+        views.append(BoardView(left_px, right_px))
+    flat = calibrate_stereo(views, board, rig.left.size_px, lens=4)
+    bent = calibrate_stereo(views, board, rig.left.size_px, lens=4, warp=True)
+    assert bent.bundle.warp_mm is not None
+    np.testing.assert_allclose(bent.bundle.warp_mm, [0.3, -0.1], atol=0.02)
+    assert bent.rms_px < 0.035
+    assert flat.rms_px > 2 * bent.rms_px
+    assert space_error_mm(bent.rig, rig) < space_error_mm(flat.rig, rig) / 3

@@ -99,3 +99,17 @@ def test_the_drawn_board_is_gray_where_there_is_none() -> None:
     left, _ = draw_board(RIG, checkerboard_texture((9, 7), 6.0), pose(PLAIN), noise_gray=0.0)
     assert left[0, 0] == 128
     assert cv2.minMaxLoc(left)[1] > 220
+
+
+def test_a_border_that_was_taken_for_a_row_of_corners_is_no_board() -> None:
+    # The board's right end is out of the image; the detector finds as many corners as were wanted all the same, eight
+    # of them where the white border begins, and every other one by a column too far.
+    rig, board = default_rig(), Checkerboard(12, 9, 7.0)
+    turn = Rotation.from_euler("zyx", [8.5, 16.1, 3.1], degrees=True).as_matrix()
+    at = RigidTransform(turn, np.array([65.5, 22.1, 225.2]) - turn @ board.points_mm.mean(axis=0))
+    left, _ = draw_board(rig, checkerboard_texture((12, 9), 7.0), at)
+    found, _ = cv2.findChessboardCornersSB(left, board.inner_corners, flags=cv2.CALIB_CB_NORMALIZE_IMAGE)
+    assert found
+    detection = board.find(left)
+    assert detection.corners_px is None
+    assert "8 of its corners are none" in detection.fault

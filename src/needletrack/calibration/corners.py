@@ -24,11 +24,15 @@ _BLUR_PX = (0.25, 6.0)
 
 @dataclass(frozen=True, slots=True)
 class FittedCorners:
-    """corners_px (N, 2), NaN where the fit failed; blur_px and contrast_gray (N,): sigma of the edges, half step."""
+    """corners_px (N, 2), NaN where the fit failed; blur_px and contrast_gray (N,): sigma of the edges, half step.
+
+    misfit (N,): what the model leaves of the picture, rms, as a share of the half step; small where a corner is.
+    """
 
     corners_px: Float
     blur_px: Float
     contrast_gray: Float
+    misfit: Float
 
 
 def fit_corners(
@@ -92,7 +96,9 @@ def fit_corners(
     # A fit that ran away, or that sees no corner, is none.
     lost = (np.linalg.norm(state[:, :2], axis=1) > 0.25 * shortest) | (total < 12) | ~np.isfinite(found).all(axis=1)
     found[lost] = np.nan
-    return FittedCorners(found, np.exp(state[:, 4]), np.abs(state[:, 8]))
+    contrast = np.abs(state[:, 8])
+    misfit = np.sqrt(cost / total) / np.maximum(contrast, 1.0)
+    return FittedCorners(found, np.exp(state[:, 4]), contrast, misfit)
 
 
 def _linearized(state: Float, away: Float, gray: Float) -> tuple[Float, Float]:

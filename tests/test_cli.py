@@ -236,6 +236,9 @@ def test_a_fresh_pair_says_whether_the_cameras_stand(tmp_path: Path) -> None:
     assert moved.exit_code == 1
     assert "MOVED" in moved.stdout
     assert "calibrate anew" in moved.stdout
+    calibration = rig.calibration.model_copy(update={"uncertainty": None})
+    write_rig(replace(rig, calibration=calibration), tmp_path / "plain.yaml")
+    assert "states no uncertainty" in run("check", tmp_path / "plain.yaml", fresh, *given).stdout
     other = refused("check", output, RECORDINGS / "calib-a", "--square-mm", 2)
     assert "the rig says" in other
 

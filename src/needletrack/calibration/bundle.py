@@ -38,11 +38,11 @@ _MOST_FALSE = 0.15
 class Bundle:
     """The rig that explains the corners best, and how well.
 
-    covariance (P, P): of `Parameters.of(rig)`, scaled by what the residuals are. left_from_board: of each view.
-    residual_px (V, 2, N, 2): view, camera, corner; NaN where a corner was not seen or was left out as false.
-    sigma_px: standard deviation of one coordinate of a corner, from the residuals and the degrees of freedom.
-    log_evidence: by which lens models are compared. warp_mm: how far the middle of the board stands out along its x
-    and its y; None where it was taken for flat.
+    covariance (P, P): of the parameters of `geometry.uncertainty`, scaled by what the residuals are. left_from_board:
+    of each view. residual_px (V, 2, N, 2): view, camera, corner; NaN where a corner was not seen or was left out as
+    false. sigma_px: standard deviation of one coordinate of a corner, from the residuals and the degrees of freedom.
+    bic: Bayesian information criterion, by which lens models are compared. warp_mm: how far the middle of the board
+    stands out along its x and its y; None where it was taken for flat.
     """
 
     rig: StereoRig

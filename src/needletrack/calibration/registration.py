@@ -5,6 +5,7 @@ tip's place in the flange is solved for as well.
 """
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from scipy.optimize import least_squares
@@ -139,7 +140,7 @@ def _linear(rig_mm: Float, rotations: Float, flange_mm: Float) -> Float:
     return np.concatenate([turn, solution[9:]])
 
 
-def _solve(start: Float, rig_mm: Float, rotations: Float, flange_mm: Float):  # type: ignore[no-untyped-def]
+def _solve(start: Float, rig_mm: Float, rotations: Float, flange_mm: Float) -> Any:
     return least_squares(_pose_residual, start, args=(rig_mm, rotations, flange_mm), x_scale="jac")
 
 

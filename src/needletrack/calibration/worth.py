@@ -27,7 +27,7 @@ _TILT_DEG = 35.0
 
 @dataclass(frozen=True, slots=True)
 class Expected:
-    """Root mean square error in space over the workspace, mm, of one corner in one pixel apart from any noise.
+    """Root mean square error, mm, over the workspace, that the calibration alone gives points in space.
 
     before_mm: in the left camera's frame; after_mm: after the best rigid alignment.
     """

@@ -234,10 +234,14 @@ def calibrate_from_pictures(
 
 @dataclass(frozen=True, slots=True)
 class RigCheck:
-    """What fresh pictures of the board say about a rig; left_out: a sentence for each pair that could not serve."""
+    """What fresh pictures of the board say about a rig; left_out: a sentence for each pair that could not serve.
+
+    is_exact: the rig file states no uncertainty, so that the calibration counts as exact.
+    """
 
     check: BoardCheck
     left_out: tuple[str, ...]
+    is_exact: bool = False
 
     def told(self) -> tuple[str, ...]:
         """The verdict and what it rests on, in a few lines for a person."""
@@ -263,6 +267,8 @@ class RigCheck:
             error = f"{caused.before_mm:.2f} mm rms off in the workspace, {caused.after_mm:.2f} mm in shape"
             verdict = ("MOVED", f"tracks are {error}: calibrate anew")
         lines.append(verdict)
+        if self.is_exact:
+            lines.append(("note", "the rig file states no uncertainty: its own error counts as a motion"))
         return tuple(f"{name:12}{text}" for name, text in lines)
 
 
@@ -295,7 +301,7 @@ def check_pictures(rig: Rig, pictures: BoardPictures, board: Board, workspace: W
         board,
         space_grid_mm(rig, ranges[0], ranges[1], ranges[2]),
     )
-    return RigCheck(checked, tuple(left_out))
+    return RigCheck(checked, tuple(left_out), stated is None)
 
 
 def described(board: Board) -> str:

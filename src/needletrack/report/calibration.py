@@ -51,7 +51,7 @@ def checks(found: BoardCalibration) -> tuple[Check, ...]:
     used, left_out = len(found.solved.used), len(found.left_out)
     # A right corner's distance from a line has the noise of one coordinate of two corners.
     own_px = np.sqrt(2) * found.solved.bundle.sigma_px
-    larger = next((each for each in found.improvements if "larger" in each.change or "large" in each.change), None)
+    larger = next((each for each in found.improvements if "times as large" in each.change), None)
     tilted = next((each for each in found.improvements if "tilted" in each.change), None)
     cure = "; ".join(
         f"{each.change}: {each.expected.before_mm:.3f} mm" for each in (larger, tilted) if each is not None

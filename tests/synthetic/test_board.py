@@ -54,6 +54,14 @@ def test_a_blurred_picture_says_how_much() -> None:
     assert view.blur_px[1] == pytest.approx(2.0, abs=0.2)
 
 
+def test_an_overexposed_board_is_neither_blurred_nor_somewhere_else() -> None:
+    at = pose(PLAIN)
+    view = find_board(*draw_board(RIG, checkerboard_texture((9, 7), 6.0), at, exposure=1.9), PLAIN)
+    assert errors_px(view, PLAIN, at).max() < 0.06
+    # White is half as bright again as what 255 shows: taken as it is, its edges would look three times as wide.
+    assert view.blur_px[0] == pytest.approx(0.6, abs=0.15)
+
+
 def test_markers_tell_every_turn_and_a_part_is_enough() -> None:
     at = pose(MARKED, x=48.0)
     images = draw_board(RIG, marked_texture(), at)

@@ -19,8 +19,8 @@ MIN_SQUARES = 4
 
 # Of a board with markers: fewer corners than this hold no pose.
 _LEAST_CORNERS = 12
-# Two crossing edges leave less of the picture than this share of their step: 0.02 to 0.35 where a corner is, in focus
-# and out of it, 0.6 where the board's border was taken for one.
+# Two crossing edges leave less of the picture than this share of their step: 0.02 to 0.15 where a corner is, 0.6 where
+# the board's border was taken for one.
 _NO_CORNER, _MOST_NO_CORNERS = 0.45, 2
 _DEFAULT_DICTIONARY = "DICT_5X5_1000"
 

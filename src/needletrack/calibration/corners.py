@@ -1,10 +1,11 @@
 """Corners of a checkerboard to a few hundredths of a pixel: two blurred edges that cross, fitted to the picture.
 
 Within less than a square of it, a corner is a + b·(p - p0) + c erf(d1 / √2 s) erf(d2 / √2 s): d1 and d2 are distances
-from its two edges, s the blur. Gauss-Newton over all pixels around, all corners at once. On path-traced boards of known
-place whose squares are 11 px wide, localized Radon transforms (Duda & Frese 2018) leave 0.06 px a coordinate, alike
-for neighbouring corners, so that a rig is four times as wrong as its residuals promise; gradients (cv2.cornerSubPix)
-0.077 px at best and 0.3 px where their window meets the next corner; this 0.02 px.
+from its two edges, s the blur. Gauss-Newton over all pixels around, all corners at once; where the picture is saturated
+the model may go beyond it, or white that is overexposed eats into black and passes for blur. On path-traced boards of
+known place whose squares are 10 px wide, localized Radon transforms (Duda & Frese 2018) leave 0.06 px a coordinate,
+alike for neighbouring corners, so that a rig is four times as wrong as its residuals promise; gradients
+(cv2.cornerSubPix) 0.077 px at best and 0.3 px where their window meets the next corner; this 0.03 px.
 """
 
 from dataclasses import dataclass
@@ -18,8 +19,9 @@ from needletrack.records import Float, Image
 _REACH = 0.42
 _MOST_HALF_PX = 10
 _ROUNDS = 12
+_SATURATED_GRAY = 250.0
 _SETTLED_PX = 1e-3
-_BLUR_PX = (0.25, 6.0)
+_BLUR_PX, _USUAL_BLUR_PX = (0.25, 6.0), 0.7
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,6 +70,12 @@ def fit_corners(
     state[:, 5] = (weight * gray).sum(axis=1) / total
     signs = np.sign((away @ lattice.swapaxes(1, 2)).prod(axis=-1))
     state[:, 8] = (weight * (gray - state[:, 5:6]) * signs).sum(axis=1) / total
+    # White that is saturated may be far brighter: begun beyond it, the fit finds how far; begun below, it does not.
+    is_saturated = ((gray >= _SATURATED_GRAY) * weight).sum(axis=1) > 0.2 * total
+    darkest = np.where(weight > 0, gray, np.inf).min(axis=1)
+    state[:, 5] = np.where(is_saturated, 255.0, state[:, 5])
+    state[:, 8] = np.where(is_saturated, np.sign(state[:, 8]) * (255.0 - darkest), state[:, 8])
+    state[:, 4] = np.log(_USUAL_BLUR_PX)
     damping = np.full(count, 1e-3)
     residual, jacobian = _linearized(state, away, gray)
     cost = (weight * residual**2).sum(axis=1)
@@ -133,4 +141,6 @@ def _linearized(state: Float, away: Float, gray: Float) -> tuple[Float, Float]:
         ],
         axis=-1,
     )
-    return gray - model, jacobian
+    # What is saturated was at least so bright: a model beyond it is no misfit (a censored fit).
+    beyond = (gray >= _SATURATED_GRAY) & (model >= gray)
+    return np.where(beyond, 0.0, gray - model), np.where(beyond[..., None], 0.0, jacobian)

@@ -43,13 +43,17 @@ def draw_board(
     *,
     blur_px: float = 0.5,
     noise_gray: float = 1.5,
+    exposure: float = 1.0,
     seed: int = 0,
 ) -> tuple[Image, Image]:
-    """What both cameras see of a board (rows, columns), blurred by a sigma of blur_px, with read noise."""
+    """What both cameras see of a board (rows, columns), blurred by a sigma of blur_px, with read noise.
+
+    exposure: times the usual one; what it takes beyond 255 is saturated.
+    """
     random = np.random.default_rng(seed)
     poses = (left_from_board, rig.right_from_left @ left_from_board)
     left, right = (
-        _draw(camera, texture, pose, blur_px, noise_gray, random)
+        _draw(camera, texture, pose, blur_px, noise_gray, exposure, random)
         for camera, pose in zip((rig.left, rig.right), poses, strict=True)
     )
     return left, right
@@ -61,6 +65,7 @@ def _draw(
     camera_from_board: RigidTransform,
     blur_px: float,
     noise_gray: float,
+    exposure: float,
     random: np.random.Generator,
 ) -> Image:
     width, height = camera.size_px
@@ -87,7 +92,7 @@ def _draw(
     seen = np.where(depth > 0, seen, _BACKGROUND_GRAY).astype(np.float32)
     picture = cv2.resize(seen, camera.size_px, interpolation=cv2.INTER_AREA)
     picture = cv2.GaussianBlur(picture, (0, 0), blur_px) if blur_px > 0 else picture
-    noisy = picture + random.normal(0, noise_gray, picture.shape)
+    noisy = exposure * picture + random.normal(0, noise_gray, picture.shape)
     return np.asarray(np.clip(np.rint(noisy), 0, 255), dtype=np.uint8)
 
 

@@ -85,7 +85,8 @@ class Refined:
 
     The points of `fit` and of `observed` correspond. tip_px holds the tip as the left and the right view alone place
     it, raw px (2, 2); tip_is_free is false where something crosses there, behind which the needle may go on. log_odds:
-    of such a needle over none, both views together; no single section has more than its say.
+    of such a needle over none, both views together; no single section has more than its say. calibration_mm2 (N, 3, 3):
+    what the calibration leaves open at each point, where that is known.
     """
 
     fit: CurveFit

@@ -2,25 +2,26 @@
 
 import json
 import re
+import shutil
 import socket
 import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
-from datetime import datetime
+from dataclasses import replace
+from datetime import UTC, datetime
 from pathlib import Path
 
+import numpy as np
 import pytest
 from rich.console import Group
-from tests.recording.small_recording import small_rig
 from typer.testing import CliRunner, Result
 
 import needletrack
-from needletrack.calibration.board import Checkerboard
+from needletrack.calibration.drift import Motion
 from needletrack.cli import app
 from needletrack.config import load_config
 from needletrack.publish.publisher import ZenohPublisher
 from needletrack.publish.schema import example_messages, example_run
-from needletrack.recording.board import BoardCalibration
 from needletrack.rig import find_rig, read_rig, write_rig
 
 RECORDINGS = Path(__file__).parent / "data" / "recordings"
@@ -50,7 +51,19 @@ def test_the_module_is_the_program() -> None:
 
 def test_without_a_command_it_lists_the_commands() -> None:
     result = run()
-    for command in ("demo", "replay", "report", "watch", "rig", "config", "calibrate", "table1", "version"):
+    for command in (
+        "demo",
+        "replay",
+        "report",
+        "watch",
+        "rig",
+        "config",
+        "calibrate",
+        "check",
+        "register",
+        "table1",
+        "version",
+    ):
         assert re.search(rf"\b{command}\b", result.output)
 
 
@@ -105,22 +118,42 @@ def test_a_configuration_is_checked(tmp_path: Path) -> None:
     assert "did you mean tracking.needle.max_diameter_mm?" in refused("config", "check", config)
 
 
-def test_calibrate_writes_what_the_board_gave(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    given: list[object] = []
-
-    def calibrated(folder: Path, board: Checkerboard, name: str, calibrated_at: datetime) -> BoardCalibration:
-        given.extend((folder, board, name, calibrated_at.tzinfo is not None))
-        return BoardCalibration(small_rig(), ("1.png: the board was not found",), 0.125)
-
-    monkeypatch.setattr("needletrack.recording.board.calibrate_from_recording", calibrated)
+def test_calibrate_writes_the_rig_and_the_report(tmp_path: Path) -> None:
+    folder = tmp_path / "bench 2"
+    shutil.copytree(RECORDINGS / "calib-b", folder)
+    broken = min((folder / "cam1" / "data").glob("*.png"))
+    broken.write_bytes(broken.read_bytes()[:-20])
     output = tmp_path / "rig.yaml"
-    board = RECORDINGS / "calib-b"
-    result = run("calibrate", board, "--square-mm", 10, "--squares", "12x9", "--output", output)
+    result = run("calibrate", folder, "--square-mm", 10, "--squares", "12x9", "--output", output)
     assert result.exit_code == 0, result.stderr
-    assert given == [board, Checkerboard(12, 9, 10.0), "calib-b", True]
-    assert read_rig(output).digest == small_rig().digest
-    assert result.stderr == "left out: 1.png: the board was not found\n"
-    assert "worst view 0.125 px rms" in result.stdout
+    rig = read_rig(output)
+    assert rig.name == "bench-2"
+    assert rig.calibration.views == 7
+    stated = rig.calibration.uncertainty
+    assert stated is not None
+    assert stated.after_alignment_mm is not None
+    assert 0 < stated.after_alignment_mm < 0.05
+    assert result.stderr.startswith("left out: ")
+    assert str(broken) in result.stderr
+    for expected in ("7 used, 1 left out", "held out", "mm rms to expect in the workspace", "take 5 more views"):
+        assert expected in result.stdout
+    page = (tmp_path / "rig-calibration.html").read_text()
+    assert "Calibration of bench-2" in page
+    assert "http" not in page.replace("http-equiv", "")
+
+
+def test_two_folders_of_pictures_pair_by_their_numbers(tmp_path: Path) -> None:
+    for camera, side in (("cam0", "left"), ("cam1", "right")):
+        (tmp_path / side).mkdir()
+        for index, file in enumerate(sorted((RECORDINGS / "calib-b" / camera / "data").glob("*.png"))):
+            shutil.copy(file, tmp_path / side / f"{side}{index:02}.png")
+    output = tmp_path / "rig.yaml"
+    given = ("--square-mm", 10, "--squares", "12x9", "--output", output, "--name", "pair")
+    assert run("calibrate", tmp_path / "left", tmp_path / "right", *given).exit_code == 0
+    assert read_rig(output).calibration.views == 8
+    (tmp_path / "empty").mkdir()
+    told = refused("calibrate", tmp_path / "left", tmp_path / "empty", "--square-mm", 10)
+    assert "no two pictures pair" in told
 
 
 @pytest.mark.parametrize("squares", ["11", "11x", "11x11x11", "axb", "-1x5"])
@@ -180,3 +213,73 @@ def test_watch_says_that_nobody_is_there() -> None:
         endpoint = f"tcp/127.0.0.1:{probe.getsockname()[1]}"
     assert "nobody answers at" in refused("watch", "lab", "--connect", endpoint, "--wait", 0.1)
     assert "write it as tcp/127.0.0.1:7447" in refused("watch", "lab", "--connect", "localhost")
+
+
+def test_a_fresh_pair_says_whether_the_cameras_stand(tmp_path: Path) -> None:
+    given = ("--square-mm", 10, "--squares", "12x9")
+    output = tmp_path / "rig.yaml"
+    assert run("calibrate", RECORDINGS / "calib-b", *given, "--output", output).exit_code == 0
+    fresh = tmp_path / "fresh"
+    for camera in ("cam0", "cam1"):
+        (fresh / camera / "data").mkdir(parents=True)
+        lines = (RECORDINGS / "calib-b" / camera / "data.csv").read_text().splitlines()
+        (fresh / camera / "data.csv").write_text("\n".join(lines[:2]) + "\n")
+        name = lines[1].split(",")[1]
+        shutil.copy(RECORDINGS / "calib-b" / camera / "data" / name, fresh / camera / "data" / name)
+    still = run("check", output, fresh, *given)
+    assert still.exit_code == 0, still.output
+    assert "stands where it was calibrated" in still.stdout
+    rig = read_rig(output)
+    bumped = replace(rig, right_from_left=Motion(turn_deg=np.array([0.0, 0.1, 0.0])).applied_to(rig).right_from_left)
+    write_rig(bumped, tmp_path / "bumped.yaml")
+    moved = run("check", tmp_path / "bumped.yaml", fresh, *given)
+    assert moved.exit_code == 1
+    assert "MOVED" in moved.stdout
+    assert "calibrate anew" in moved.stdout
+    calibration = rig.calibration.model_copy(update={"uncertainty": None})
+    write_rig(replace(rig, calibration=calibration), tmp_path / "plain.yaml")
+    assert "states no uncertainty" in run("check", tmp_path / "plain.yaml", fresh, *given).stdout
+    other = refused("check", output, RECORDINGS / "calib-a", "--square-mm", 2)
+    assert "the rig says" in other
+
+
+def test_register_writes_the_robot_s_frame_into_the_rig(tmp_path: Path) -> None:
+    write_rig(find_rig(STEER), tmp_path / "rig.yaml")
+    points = [(-40, -30, 220), (45, -25, 230), (-35, 35, 240), (40, 30, 225), (0, 0, 290)]
+    rows = [f"{x},{y},{z},{z + 100},{-x},{-y}" for x, y, z in points]
+    pairs = tmp_path / "pairs.csv"
+    pairs.write_text("rig_x_mm,rig_y_mm,rig_z_mm,robot_x_mm,robot_y_mm,robot_z_mm\n" + "\n".join(rows) + "\n")
+    result = run("register", tmp_path / "rig.yaml", pairs, "--frame-id", "robot_base")
+    assert result.exit_code == 0, result.output
+    assert "0.000 mm rms" in result.stdout
+    rig = read_rig(tmp_path / "rig.yaml")
+    assert rig.frame_id == "robot_base"
+    assert "registered  to robot_base, 5 points" in run("rig", "show", tmp_path / "rig.yaml").stdout
+    lines = tmp_path / "tracks.jsonl"
+    run("replay", STEER, "--rig", tmp_path / "rig.yaml", "--end", 1, "--output", lines)
+    assert json.loads(lines.read_text())["frame_id"] == "robot_base"
+
+
+def test_rigs_go_out_and_come_back_in_other_formats(tmp_path: Path) -> None:
+    for kind, name in (("ros", "ros"), ("opencv", "stereo.yaml"), ("mrcal", "mrcal"), ("kalibr", "camchain.yaml")):
+        result = run("rig", "export", STEER, tmp_path / name, "--format", kind)
+        assert result.exit_code == 0, result.output
+        files = [line.removeprefix("written: ") for line in result.stdout.splitlines()]
+        back = run("rig", "import", *files, "--output", tmp_path / "back.yaml", "--name", "back")
+        assert back.exit_code == 0, back.output
+        assert f"by {kind}" in back.stdout
+    assert "--size" in refused("rig", "import", tmp_path / "stereo.yaml", "--size", "big")
+
+
+def test_an_old_calibration_is_warned_about(tmp_path: Path) -> None:
+    rig = find_rig(STEER)
+    old = rig.calibration.model_copy(update={"calibrated_at": datetime(2020, 1, 1, tzinfo=UTC)})
+    write_rig(replace(rig, calibration=old), tmp_path / "rig.yaml")
+    checked = run("rig", "check", tmp_path / "rig.yaml")
+    assert checked.exit_code == 0
+    assert "days ago, more than 30 (rig.max_age_days)" in checked.stderr
+    played = run("replay", STEER, "--rig", tmp_path / "rig.yaml", "--end", 1)
+    assert "days ago, more than 30" in played.stderr
+    patient = tmp_path / "needletrack.toml"
+    patient.write_text("[rig]\nmax_age_days = 100000\n")
+    assert run("rig", "check", tmp_path / "rig.yaml", "--config", patient).stderr == ""

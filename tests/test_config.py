@@ -153,7 +153,7 @@ def test_an_absolute_path_stays(tmp_path: Path) -> None:
             "unknown key tracking.needle.min_diamter_mm: did you mean tracking.needle.min_diameter_mm?",
         ),
         ("[needle]\nmin_diameter_mm = 1", "unknown key needle: did you mean tracking.needle?"),
-        ("[zebra]\n", "unknown key zebra: known here: rig, tracking, pairing, publishing"),
+        ("[zebra]\n", "unknown key zebra: known here: rig, tracking, drift, pairing, publishing"),
         (
             "[pairing]\ntolerance_us = -1.0",
             "pairing.tolerance_us = -1.0: should be greater than 0 (Greatest difference",

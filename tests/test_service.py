@@ -5,8 +5,10 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+from needletrack.calibration.drift import DriftParameters, Motion
 from needletrack.errors import CaptureError, RecordingError
 from needletrack.publish.message import RunContext, ServiceState, Source, TrackMessage
 from needletrack.recording.asl import AslRecording
@@ -302,3 +304,40 @@ def test_the_status_counts_and_gives_rates_since_the_last_one(recording: AslReco
     assert later.rates.pairs_per_s == 0
     assert after.heartbeat_s == 0.25
     assert (after.rig, after.rig_digest) == (recording.rig.name, recording.rig.digest)
+
+
+def test_a_pitched_camera_is_noticed_and_said_and_tracking_goes_on_from_its_own_track(recording: AslRecording) -> None:
+    # As if the right camera had been turned by 0.1 degrees since the calibration.
+    rig = recording.rig
+    bumped = Motion(turn_deg=np.array([-0.1, 0.0, 0.0])).applied_to(rig)
+    before = replace(rig, right_from_left=bumped.right_from_left)
+    given: list[NeedleTrack | None] = []
+
+    def tracker(pair: StereoPair, previous: NeedleTrack | None) -> NeedleTrack:
+        given.append(previous)
+        return track_pair(pair, before, None, previous)
+
+    kept = Kept()
+    source = ReplaySource(AslRecording(recording.folder, before))
+    drift = DriftParameters(least_pairs=5)
+    service = Service(source, tracker, before, context(recording), every_frame=True, drift=drift)
+    service.run([kept], threading.Event())
+    told = [Reason.CALIBRATION_DRIFT in track.reasons for track in kept.tracks]
+    # Not before there are tips enough to tell, and then for good.
+    first = told.index(True)
+    assert 4 <= first <= 10
+    assert all(told[first:])
+    assert all(track.status is not Status.OK for track in kept.tracks[first:])
+    assert "calibration_drift" in kept.messages[first].reasons
+    assert all(previous is None or Reason.CALIBRATION_DRIFT not in previous.reasons for previous in given)
+    # The rig as it is has no such thing.
+    kept = Kept()
+    Service(
+        ReplaySource(recording),
+        lambda pair, previous: track_pair(pair, rig, None, previous),
+        rig,
+        context(recording),
+        every_frame=True,
+        drift=drift,
+    ).run([kept], threading.Event())
+    assert not any(Reason.CALIBRATION_DRIFT in track.reasons for track in kept.tracks)

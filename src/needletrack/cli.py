@@ -5,6 +5,7 @@ be used, with one line on stderr that says what and the remedy; 130 after Ctrl-C
 """
 
 import os
+import re
 from collections.abc import Callable
 from datetime import UTC, datetime
 from functools import wraps
@@ -21,6 +22,8 @@ from needletrack.publish.keys import DEFAULT_PREFIX
 from needletrack.publish.session import DEFAULT_ENDPOINT
 
 if TYPE_CHECKING:
+    from needletrack.calibration.board import Board
+    from needletrack.calibration.bundle import Terms
     from needletrack.rig import Rig
 
 # What loads NumPy, SciPy and OpenCV is imported by the commands themselves: they read these variables when
@@ -30,6 +33,7 @@ for _variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "OPENCV_FOR_THREADS
 
 LAB_RECORDING = Path("tests/data/recordings/lab-a")
 _TABLE_WIDTH = 160
+_TERMS: "dict[str, Terms]" = {"4": 4, "5": 5, "8": 8}
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -245,17 +249,47 @@ def rig_show(path: RigPath) -> None:
 @rig_app.command("import")
 @plain_errors
 def rig_import(
-    camchain: Annotated[Path, typer.Argument(metavar="CAMCHAIN", help="Kalibr's camchain.yaml.")],
+    files: Annotated[
+        list[Path],
+        typer.Argument(
+            metavar="FILE...",
+            help="Kalibr camchain, OpenCV FileStorage (one or two files), MATLAB .mat; or the left and the right "
+            "camera's ROS camera_info or mrcal .cameramodel.",
+        ),
+    ],
     output: Annotated[Path, typer.Option(help="The rig file to write.")] = Path("rig.yaml"),
     name: Annotated[str | None, typer.Option(help="The rig's name; else its folder's.")] = None,
+    size: Annotated[str | None, typer.Option(help="Of the images, e.g. 1280x1024, where no file says it.")] = None,
+    unit_mm: Annotated[
+        float | None, typer.Option(help="Millimetres in the files' unit of length, where it is not the usual one.")
+    ] = None,
 ) -> None:
-    """Make a rig file from a Kalibr camchain."""
-    from needletrack.rig import import_camchain, write_rig
+    """Make a rig file from another tool's calibration."""
+    from needletrack.formats.exchange import import_rig
+    from needletrack.rig import write_rig
 
-    imported = import_camchain(camchain, name)
+    size_px = None if size is None else _numbers(size, "--size", "1280x1024, width and height")
+    imported = import_rig(files, name or _rig_name(files[0].resolve().parent), size_px=size_px, unit_mm=unit_mm)
     write_rig(imported, output)
     _show_rig(imported)
     typer.echo(f"written: {output}")
+
+
+@rig_app.command("export")
+@plain_errors
+def rig_export(
+    path: RigPath,
+    output: Annotated[Path, typer.Argument(metavar="OUTPUT", help="The file to write; the folder for ros and mrcal.")],
+    kind: Annotated[
+        Literal["kalibr", "ros", "opencv", "matlab", "mrcal"], typer.Option("--format", help="Whose format.")
+    ],
+) -> None:
+    """Write a rig in another tool's format."""
+    from needletrack.formats.exchange import export_rig
+    from needletrack.replay import rig_at
+
+    for written in export_rig(rig_at(path), kind, output):
+        typer.echo(f"written: {written}")
 
 
 @rig_app.command("check")
@@ -266,7 +300,10 @@ def rig_check(path: RigPath, config: ConfigFile = None) -> None:
     from needletrack.replay import rig_at
 
     checked = rig_at(path)
-    checked.require_view_of(load_config(config).tracking.workspace)
+    settings = load_config(config)
+    checked.require_view_of(settings.tracking.workspace)
+    if warning := checked.age_warning(settings.rig.max_age_days, datetime.now(UTC)):
+        typer.echo(f"warning: {warning}", err=True)
     typer.echo(f"{path}: ok, rig {checked.name}, digest {checked.digest}")
 
 
@@ -293,25 +330,149 @@ def config_check(path: Annotated[Path, typer.Argument(metavar="PATH", help="TOML
 @app.command()
 @plain_errors
 def calibrate(
-    recording: Annotated[Path, typer.Argument(metavar="RECORDING", help="Recording of the board: ten views or more.")],
-    square_mm: Annotated[float, typer.Option(help="Side of a square, mm.")],
+    folder: Annotated[
+        Path,
+        typer.Argument(
+            metavar="FOLDER", help="Recording of the board, or the left camera's pictures; ten views or more."
+        ),
+    ],
+    right: Annotated[
+        Path | None,
+        typer.Argument(metavar="RIGHT", help="The right camera's pictures, where FOLDER has the left ones."),
+    ] = None,
+    *,
+    square_mm: Annotated[float, typer.Option(help="Side of a square, mm: measure it.")],
     squares: Annotated[str, typer.Option(help="Squares across and down.")] = "11x11",
+    marker_mm: Annotated[float | None, typer.Option(help="Side of a marker, mm: the board is a ChArUco board.")] = None,
+    dictionary: Annotated[str, typer.Option(help="Dictionary of the ChArUco board's markers.")] = "DICT_5X5_1000",
+    legacy: Annotated[bool, typer.Option("--legacy", help="ChArUco board as OpenCV drew it before 4.6.")] = False,
     output: Annotated[Path, typer.Option(help="The rig file to write.")] = Path("rig.yaml"),
-    name: Annotated[str | None, typer.Option(help="The rig's name; else the recording's.")] = None,
+    report: Annotated[Path | None, typer.Option(help="The HTML report; else beside the rig file.")] = None,
+    name: Annotated[str | None, typer.Option(help="The rig's name; else the folder's.")] = None,
+    lens: Annotated[
+        Literal["auto", "4", "5", "8"],
+        typer.Option(help="Terms of the distortion: 4 or 5 radial-tangential, 8 rational; auto: what the views carry."),
+    ] = "auto",
+    warp: Annotated[bool, typer.Option("--warp", help="Solve for the board's bend as well.")] = False,
+    config: ConfigFile = None,
+    stream: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="RECORDING",
+            help="With guidance: take the views that add something from a stream into FOLDER, a new one, then "
+            "calibrate. The stream is a recording, played at its own pace.",
+        ),
+    ] = None,
 ) -> None:
-    """Make a rig file from a recording of a checkerboard."""
-    from needletrack.calibration.board import Checkerboard
-    from needletrack.recording.board import calibrate_from_recording
+    """Make a rig file from pictures of a checkerboard or a ChArUco board, and a report of what it is worth."""
+    from needletrack.config import load_config
+    from needletrack.recording.board import calibrate_from_pictures, open_board_pictures
+    from needletrack.report.calibration import write_calibration_report
     from needletrack.rig import write_rig
+    from needletrack.terminal import Interruption, steps_shown
 
-    across, down = _parsed(squares)
-    board = Checkerboard(across, down, square_mm)
-    found = calibrate_from_recording(recording, board, name or recording.resolve().name, datetime.now(UTC))
+    board = _board(squares, square_mm, marker_mm, dictionary, legacy=legacy)
+    workspace = load_config(config).tracking.workspace
+    console = Console(stderr=True)
+    if stream is not None:
+        from needletrack.guidance import GuidanceShown, collect
+        from needletrack.recording.board import BoardRecorder, board_stream
+
+        with Interruption() as interruption, GuidanceShown(console) as shown:
+            collect(board_stream(stream), board, BoardRecorder(folder), interruption.stop, shown.take)
+    pictures = open_board_pictures(folder, right)
+    with steps_shown(console, "looking for the board", len(pictures.names)) as progress:
+        found = calibrate_from_pictures(
+            pictures,
+            board,
+            name or _rig_name(folder),
+            datetime.now(UTC),
+            lens=None if lens == "auto" else _TERMS[lens],
+            warp=warp,
+            workspace=workspace,
+            progress=progress,
+        )
     write_rig(found.rig, output)
+    page = report or output.with_name(f"{output.stem}-calibration.html")
+    write_calibration_report(found, pictures, board, page)
     for sentence in found.left_out:
         typer.echo(f"left out: {sentence}", err=True)
     _show_rig(found.rig)
-    typer.echo(f"worst view {found.worst_view_rms_px:.3f} px rms; written: {output}")
+    for line in found.told():
+        typer.echo(line)
+    typer.echo(f"written: {output}, {page}")
+
+
+@app.command()
+@plain_errors
+def check(
+    rig: Annotated[Path, typer.Argument(metavar="RIG", help="Rig file.")],
+    folder: Annotated[
+        Path,
+        typer.Argument(metavar="FOLDER", help="One fresh pair of pictures of the board, or more, as for calibrate."),
+    ],
+    right: Annotated[Path | None, typer.Argument(metavar="RIGHT", help="As for calibrate.")] = None,
+    *,
+    square_mm: Annotated[float, typer.Option(help="Side of a square, mm.")],
+    squares: Annotated[str, typer.Option(help="Squares across and down.")] = "11x11",
+    marker_mm: Annotated[float | None, typer.Option(help="Side of a marker, mm, of a ChArUco board.")] = None,
+    dictionary: Annotated[str, typer.Option(help="Dictionary of its markers.")] = "DICT_5X5_1000",
+    legacy: Annotated[bool, typer.Option("--legacy", help="ChArUco board as OpenCV drew it before 4.6.")] = False,
+    config: ConfigFile = None,
+) -> None:
+    """Check with a fresh picture pair of a board whether the cameras still stand as they were calibrated.
+
+    Exit code 0 where they do; 1 where one has moved: calibrate anew, nothing is corrected in silence.
+    """
+    from needletrack.config import load_config
+    from needletrack.recording.board import check_pictures, open_board_pictures
+    from needletrack.replay import rig_at
+
+    checked, settings = rig_at(rig), load_config(config)
+    board = _board(squares, square_mm, marker_mm, dictionary, legacy=legacy)
+    if warning := checked.age_warning(settings.rig.max_age_days, datetime.now(UTC)):
+        typer.echo(f"warning: {warning}", err=True)
+    found = check_pictures(checked, open_board_pictures(folder, right), board, settings.tracking.workspace)
+    for line in found.told():
+        typer.echo(line)
+    if found.check.moved:
+        raise typer.Exit(1)
+
+
+@app.command()
+@plain_errors
+def register(
+    rig: Annotated[Path, typer.Argument(metavar="RIG", help="Rig file.")],
+    pairs: Annotated[
+        Path,
+        typer.Argument(
+            metavar="PAIRS",
+            help="CSV with rig_x_mm, rig_y_mm, rig_z_mm, robot_x_mm, robot_y_mm, robot_z_mm; robot_qx ... robot_qw "
+            "as well where the robot states its flange, and the rig saw the tip of its tool.",
+        ),
+    ],
+    frame_id: Annotated[str, typer.Option(help="The robot's frame, in which tracks are then published.")],
+    output: Annotated[Path | None, typer.Option(help="The rig file to write; else RIG itself.")] = None,
+) -> None:
+    """Find where the rig stands in a robot's frame; tracks are then published in that frame."""
+    from needletrack.recording.registration import read_pairs, registered
+    from needletrack.rig import read_rig, write_rig
+
+    placed, found = registered(read_rig(rig), read_pairs(pairs), frame_id, datetime.now(UTC))
+    write_rig(placed, output or rig)
+    for index, (residual, without) in enumerate(
+        zip(found.residual_mm.tolist(), found.leave_one_out_mm.tolist(), strict=True), start=1
+    ):
+        typer.echo(f"pair {index:3}    {residual:8.3f} mm off, {without:8.3f} mm by the others alone")
+    typer.echo(f"all         {found.rms_mm:8.3f} mm rms, {found.leave_one_out_rms_mm:8.3f} mm by the others alone")
+    if found.tool_mm is not None:
+        typer.echo(
+            f"tool        tip at {', '.join(f'{value:.3f}' for value in found.tool_mm.tolist())} mm in the flange"
+        )
+    turn = " ".join(f"{value:.3f}" for value in found.turn_sigma_deg.tolist())
+    shift = " ".join(f"{value:.3f}" for value in found.shift_sigma_mm.tolist())
+    typer.echo(f"sigma       turn {turn} degrees, shift {shift} mm, about the robot's axes through the points' middle")
+    typer.echo(f"written: {output or rig}; tracks are published in {frame_id}")
 
 
 @app.command()
@@ -340,10 +501,27 @@ def _complain(error: Exception) -> None:
     typer.echo(f"needletrack: {error}", err=True)
 
 
+def _board(squares: str, square_mm: float, marker_mm: float | None, dictionary: str, *, legacy: bool) -> "Board":
+    from needletrack.calibration.board import CharucoBoard, Checkerboard
+
+    across, down = _parsed(squares)
+    if marker_mm is None:
+        return Checkerboard(across, down, square_mm)
+    return CharucoBoard(across, down, square_mm, marker_mm, dictionary, legacy)
+
+
+def _rig_name(folder: Path) -> str:
+    return re.sub(r"[^A-Za-z0-9._-]+", "-", folder.resolve().name).strip("-._") or "rig"
+
+
 def _parsed(squares: str) -> tuple[int, int]:
-    across, _, down = squares.lower().partition("x")
+    return _numbers(squares, "--squares", "11x11, squares across and down")
+
+
+def _numbers(text: str, option: str, wanted: str) -> tuple[int, int]:
+    across, _, down = text.lower().partition("x")
     if not (across.isdecimal() and down.isdecimal()):
-        raise CalibrationError(f"--squares {squares!r}: write it as 11x11, squares across and down")
+        raise CalibrationError(f"{option} {text!r}: write it as {wanted}")
     return int(across), int(down)
 
 
@@ -366,3 +544,11 @@ def _show_rig(rig: "Rig") -> None:
     if info.views is not None:
         facts.append(f"{info.views} views")
     typer.echo(f"calibrated  {', '.join([*facts, info.source] if info.source else facts)}")
+    stated = info.uncertainty
+    if stated is not None and stated.before_alignment_mm is not None and stated.after_alignment_mm is not None:
+        typer.echo(
+            f"to expect   {stated.before_alignment_mm:.3f} mm rms in the workspace, {stated.after_alignment_mm:.3f} mm "
+            "after the best rigid alignment"
+        )
+    if (placed := rig.registration) is not None:
+        typer.echo(f"registered  to {placed.frame_id}, {len(placed.points_mm)} points, {placed.rms_mm:.3f} mm rms")

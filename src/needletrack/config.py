@@ -25,6 +25,7 @@ from pydantic import (
 )
 from pydantic_settings import BaseSettings, EnvSettingsSource, SettingsConfigDict, SettingsError
 
+from needletrack.calibration.drift import DriftParameters
 from needletrack.errors import ConfigError
 from needletrack.tracking.parameters import TrackingParameters
 from needletrack.validation import complaints, known_keys, nearest_key
@@ -62,6 +63,7 @@ class RigConfig(BaseModel):
         None,
         description="Rig file or Kalibr camchain, relative to this file; empty: a recording's own.",
     )
+    max_age_days: Positive = Field(30.0, description="A calibration older than this is warned about, days.")
 
 
 class PairingConfig(BaseModel):
@@ -99,6 +101,7 @@ class Config(BaseModel):
     tracking: TrackingParameters = Field(
         TrackingParameters(), description="The needle, where it can be, and how each stage looks for it."
     )
+    drift: DriftParameters = Field(DriftParameters(), description="When a camera counts as moved.")
     pairing: PairingConfig = Field(PairingConfig(), description="Which frames belong together.")
     publishing: PublishingConfig = Field(PublishingConfig(), description="Where the tracks go.")
 

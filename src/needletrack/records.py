@@ -85,6 +85,7 @@ class Reason(StrEnum):
     TIP_NOT_SEEN = "tip_not_seen"
     TIP_DISAGREES = "tip_disagrees"
     JUMP = "jump"
+    CALIBRATION_DRIFT = "calibration_drift"
     REFERENCE_METHOD = "reference_method"
 
 
@@ -105,6 +106,7 @@ REASON_MEANING: Mapping[Reason, str] = MappingProxyType(
         Reason.TIP_NOT_SEEN: "The free end was not found in both views, or something hides it: no tip is given.",
         Reason.TIP_DISAGREES: "The two views place the free end at different points.",
         Reason.JUMP: "The shape moved further since the last pair than a needle can.",
+        Reason.CALIBRATION_DRIFT: "The tips of the last pairs lie off their epipolar lines: a camera has moved.",
         Reason.REFERENCE_METHOD: "Found by the 2017 reference method, which cannot tell whether it is right.",
     }
 )
@@ -269,7 +271,8 @@ class Quality:
     """How well the shape explains the images; None where there is nothing to measure.
 
     reprojection_rms_px: of the observations across the projected axis, both views.
-    epipolar_rms_px: of the tip, found in each view alone, against its epipolar line.
+    epipolar_rms_px: of the tip, found in each view alone, against its epipolar line. Points along the needle are
+    matched by these lines and lie on them by construction: they say nothing about the calibration and do not count.
     coverage: share of the shape's length that both cameras see.
     """
 
@@ -285,17 +288,21 @@ class Evidence:
     axis_residual_px (2, N): how far the axis seen in the left and in the right view lies beside the projected curve,
     at each point of the track's curve; NaN where it was not seen. Positive to the right of the way from base to tip,
     in an image whose rows run down; undistorted px.
+    tip_px (2, 2): the tip as the left and the right view alone place it, raw px; None where it was not found.
     """
 
     left: Centerline | None = None
     right: Centerline | None = None
     correspondences: Correspondences | None = None
     axis_residual_px: Float | None = None
+    tip_px: Float | None = None
 
     def __post_init__(self) -> None:
         if self.axis_residual_px is not None:
             residual = frozen_array(self.axis_residual_px, (2, None), "axis_residual_px")
             object.__setattr__(self, "axis_residual_px", residual)
+        if self.tip_px is not None:
+            object.__setattr__(self, "tip_px", frozen_array(self.tip_px, (2, 2), "tip_px"))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

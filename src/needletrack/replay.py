@@ -1,8 +1,10 @@
 """A recording through the live loop: what the replay command, its tool and the demo share."""
 
+import logging
 import re
 from collections.abc import Sequence
 from contextlib import ExitStack, suppress
+from datetime import UTC, datetime
 from pathlib import Path
 from threading import Event
 from typing import Literal
@@ -18,6 +20,8 @@ from needletrack.rig import Rig, find_rig, import_camchain, read_rig
 from needletrack.service import RunSummary, Service, Sink, Tracker
 from needletrack.tracking.reference import track_reference
 from needletrack.tracking.track import track_pair
+
+_log = logging.getLogger(__name__)
 
 Method = Literal["curve", "reference"]
 
@@ -49,7 +53,11 @@ class Replay:
         self._start, self._paced = start, paced
         self._tracker = _tracker(method, rig, config)
         self.source = ReplaySource(recording, paced=paced, start=start, end=end, loop=loop)
-        self.context = RunContext(rig.name, Source.REPLAY, config.digest, rig.digest, deterministic=not paced)
+        if warning := rig.age_warning(config.rig.max_age_days, datetime.now(UTC)):
+            _log.warning("%s", warning)
+        self.context = RunContext(
+            rig.name, Source.REPLAY, config.digest, rig.digest, frame_id=rig.frame_id, deterministic=not paced
+        )
         self.service = Service(
             self.source,
             self._tracker,
@@ -58,6 +66,7 @@ class Replay:
             every_frame=not paced,
             independent=independent,
             heartbeat_s=config.publishing.heartbeat_s,
+            drift=config.drift,
         )
 
     def warm_up(self) -> None:

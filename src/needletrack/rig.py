@@ -11,6 +11,7 @@ import re
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, field
+from datetime import datetime
 from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
@@ -18,7 +19,7 @@ from typing import Annotated, Any, Literal, Self
 import numpy as np
 import numpy.typing as npt
 import yaml
-from annotated_types import Gt
+from annotated_types import Ge, Gt
 from pydantic import (
     AllowInfNan,
     AwareDatetime,
@@ -33,6 +34,7 @@ from needletrack.errors import CalibrationError
 from needletrack.geometry.camera import Camera
 from needletrack.geometry.stereo import StereoRig
 from needletrack.geometry.transform import RigidTransform, orthonormalized
+from needletrack.geometry.uncertainty import RigUncertainty, rigid_motions
 from needletrack.records import Float
 from needletrack.tracking.needle import Workspace
 from needletrack.validation import complaints
@@ -57,6 +59,55 @@ Finite = Annotated[float, AllowInfNan(False)]
 Size = tuple[Annotated[int, Gt(0)], Annotated[int, Gt(0)]]
 Row3 = tuple[Finite, Finite, Finite]
 Row4 = tuple[Finite, Finite, Finite, Finite]
+Matrix = tuple[tuple[Finite, ...], ...]
+
+
+class CalibrationUncertainty(BaseModel):
+    """What a calibration is worth."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    corner_sigma_px: Annotated[Finite, Ge(0)] = Field(
+        description="Standard deviation of one coordinate of a corner, from the residuals, px."
+    )
+    covariance: Matrix = Field(
+        description="Lower triangle by rows, of fx fy cx cy and the distortion of the left camera, the same of the "
+        "right one, a small turn (rad) and shift (mm) that follow right_from_left."
+    )
+    before_alignment_mm: Annotated[Finite, Ge(0)] | None = Field(
+        None, description="Error to expect in the workspace, rms, in the left camera's frame, mm."
+    )
+    after_alignment_mm: Annotated[Finite, Ge(0)] | None = Field(
+        None, description="The same after the best rigid alignment, such as a registration to a robot, mm."
+    )
+    held_out_epipolar_px: Annotated[Finite, Ge(0)] | None = Field(
+        None, description="Rms distance from the epipolar line in views that were held out, px."
+    )
+    held_out_length_mm: Annotated[Finite, Ge(0)] | None = Field(
+        None, description="Rms error of the board's lengths in views that were held out, mm."
+    )
+
+    @classmethod
+    def rows(cls, covariance: Float) -> tuple[tuple[float, ...], ...]:
+        """The lower triangle, with eight significant digits, of a covariance (P, P)."""
+        return tuple(
+            tuple(float(f"{value:.8g}") for value in row[: i + 1]) for i, row in enumerate(covariance.tolist())
+        )
+
+    @property
+    def matrix(self) -> Float:
+        """The covariance (P, P)."""
+        size = len(self.covariance)
+        full = np.zeros((size, size))
+        for i, row in enumerate(self.covariance):
+            full[i, : i + 1] = full[: i + 1, i] = row
+        return full
+
+    @model_validator(mode="after")
+    def _is_triangle(self) -> Self:
+        if any(len(row) != i + 1 for i, row in enumerate(self.covariance)):
+            raise ValueError("covariance is not a lower triangle: row 1 has one number, row 2 two, and so on")
+        return self
 
 
 class CalibrationInfo(BaseModel):
@@ -73,6 +124,48 @@ class CalibrationInfo(BaseModel):
     )
     views: Annotated[int, Gt(0)] | None = Field(None, description="Board views used; null if unknown.")
     source: str = Field("", description="Where the numbers come from, in the owner's words.")
+    uncertainty: CalibrationUncertainty | None = Field(
+        None, description="How uncertain it is; null if unknown. `needletrack calibrate` states it."
+    )
+
+
+class Registration(BaseModel):
+    """Where the rig stands in a robot's frame, from points that both know."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    frame_id: Annotated[str, Field(min_length=1)] = Field(description="The robot's frame, e.g. robot_base.")
+    rotation: tuple[Row3, Row3, Row3] = Field(description="robot_from_rig, 3 × 3 matrix, by rows.")
+    translation_mm: Row3 = Field(description="The left camera's centre in the robot's frame, mm.")
+    covariance: Matrix = Field(
+        description="6 × 6, by rows: of a small turn (rad, about the robot's axes through the points' middle) and a "
+        "shift (mm) that follow."
+    )
+    points_mm: Annotated[tuple[Row3, ...], Field(min_length=3)] = Field(
+        description="The points in the left camera's frame, mm."
+    )
+    rms_mm: Annotated[Finite, Ge(0)] = Field(description="Root mean square distance that is left.")
+    leave_one_out_mm: Annotated[Finite, Ge(0)] | None = Field(
+        None, description="The same of each point by a registration from the others, mm."
+    )
+    registered_at: AwareDatetime | None = Field(None, description="When, with a time zone; null if unknown.")
+    rig_digest: str = Field(description="Digest of the geometry that it was made with; another calibration voids it.")
+
+    @property
+    def robot_from_rig(self) -> RigidTransform:
+        """Takes points of the left camera's frame to the robot's."""
+        return RigidTransform(_rotation(self.rotation, "registration.rotation"), np.array(self.translation_mm))
+
+    @property
+    def middle_mm(self) -> Float:
+        """The middle of the points, in the left camera's frame (3,)."""
+        return np.asarray(np.mean(self.points_mm, axis=0))
+
+    @model_validator(mode="after")
+    def _has_shapes(self) -> Self:
+        if np.shape(self.covariance) != (6, 6):
+            raise ValueError("covariance is not 6 × 6")
+        return self
 
 
 @dataclass(frozen=True)
@@ -86,6 +179,7 @@ class Rig(StereoRig):
 
     name: str
     calibration: CalibrationInfo = field(default_factory=CalibrationInfo)
+    registration: Registration | None = None
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -111,6 +205,67 @@ class Rig(StereoRig):
                 "of the left camera's frame to the right one's), or a sign may be wrong"
             )
 
+        self._require_consistent_records()
+
+    def _require_consistent_records(self) -> None:
+        stated, registered = self.calibration.uncertainty, self.registration
+        if stated is not None:
+            # Checks size and sign.
+            RigUncertainty(self, stated.matrix)
+        if registered is not None:
+            if registered.rig_digest != self.geometry_digest:
+                raise ValueError(
+                    f"the registration to {registered.frame_id} was made with another calibration (digest "
+                    f"{registered.rig_digest}, this is {self.geometry_digest}): register anew, or remove it"
+                )
+            _ = registered.robot_from_rig
+
+    @cached_property
+    def uncertainty(self) -> RigUncertainty | None:
+        """How uncertain points are by the calibration; where the rig is registered, in the robot's frame.
+
+        The registration takes the rigid part of the error with it.
+        """
+        if self.calibration.uncertainty is None:
+            return None
+        reference = None if self.registration is None else np.array(self.registration.points_mm)
+        return RigUncertainty(self, self.calibration.uncertainty.matrix, reference)
+
+    def calibration_covariance_mm2(self, points_mm: npt.ArrayLike) -> Float | None:
+        """Covariance (N, 3, 3), axes of the left camera, that calibration and registration give points (N, 3) mm.
+
+        It is about the frame in which tracks are published: the left camera's, or the robot's where registered.
+        """
+        points = np.asarray(points_mm, dtype=np.float64)
+        total = None if self.uncertainty is None else self.uncertainty.covariance_mm2(points)
+        if self.registration is not None:
+            rotation = self.registration.robot_from_rig.rotation
+            motions = rigid_motions((points - self.registration.middle_mm) @ rotation.T)
+            of_robot = motions @ np.array(self.registration.covariance) @ motions.swapaxes(1, 2)
+            share = rotation.T @ of_robot @ rotation
+            total = share if total is None else total + share
+        return total
+
+    @property
+    def frame_id(self) -> str:
+        """The frame in which tracks are published: the robot's where the rig is registered."""
+        return f"{self.name}_left" if self.registration is None else self.registration.frame_id
+
+    def age_warning(self, max_age_days: float, now: datetime) -> str | None:
+        """A sentence where the calibration is older than that; None where it is not, or its date is unknown."""
+        age = self.age_days(now)
+        if age is None or age <= max_age_days:
+            return None
+        return (
+            f"rig {self.name} was calibrated {age:.0f} days ago, more than {max_age_days:g} (rig.max_age_days): run "
+            "`needletrack check` with a board, or calibrate anew"
+        )
+
+    def age_days(self, now: datetime) -> float | None:
+        """Days since the calibration; None where its date is unknown."""
+        at = self.calibration.calibrated_at
+        return None if at is None else (now - at).total_seconds() / 86_400
+
     def seen_by_both(self, points_mm: npt.ArrayLike) -> npt.NDArray[np.bool_]:
         """Which points (N, 3) mm in the left camera's frame lie in both images; (N,) bool."""
         points = np.asarray(points_mm, dtype=np.float64)
@@ -129,7 +284,19 @@ class Rig(StereoRig):
 
     @cached_property
     def digest(self) -> str:
-        """Twelve hexadecimal digits (SHA-256) of the geometry, rounded far below any accuracy."""
+        """Twelve hexadecimal digits (SHA-256) of the geometry and, where they are known, uncertainty and registration.
+
+        The geometry is rounded far below any accuracy.
+        """
+        stated, registered = self.calibration.uncertainty, self.registration
+        if stated is None and registered is None:
+            return self.geometry_digest
+        parts = [self.geometry_digest] + [part.model_dump_json() for part in (stated, registered) if part is not None]
+        return hashlib.sha256("".join(parts).encode()).hexdigest()[:12]
+
+    @cached_property
+    def geometry_digest(self) -> str:
+        """The same of the geometry alone."""
         pose, content = self.right_from_left, []
         for camera in (self.left, self.right):
             # k3 = 0 and no k3 are the same lens.
@@ -296,11 +463,15 @@ class _RigFile(BaseModel):
     cameras: _Cameras = Field(description="Both cameras.")
     right_from_left: _Pose = Field(description="Takes points of the left camera's frame to the right one's.")
     calibration: CalibrationInfo = Field(CalibrationInfo(), description="How and when it was calibrated.")
+    registration: Registration | None = Field(
+        None, description="Where it stands in a robot's frame; null: not registered. `needletrack register` finds it."
+    )
 
     def rig(self) -> Rig:
         rotation = _rotation(self.right_from_left.rotation, "right_from_left.rotation")
         pose = RigidTransform(rotation, np.array(self.right_from_left.translation_mm))
-        return Rig(self.cameras.left.camera(), self.cameras.right.camera(), pose, self.name, self.calibration)
+        left, right = self.cameras.left.camera(), self.cameras.right.camera()
+        return Rig(left, right, pose, self.name, self.calibration, self.registration)
 
     @classmethod
     def of(cls, rig: Rig) -> Self:
@@ -315,6 +486,7 @@ class _RigFile(BaseModel):
             cameras=_Cameras(left=_CameraEntry.of(rig.left), right=_CameraEntry.of(rig.right)),
             right_from_left=_Pose(rotation=(first, second, third), translation_mm=translation.tolist()),
             calibration=rig.calibration,
+            registration=rig.registration,
         )
 
 

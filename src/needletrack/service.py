@@ -13,7 +13,9 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import NamedTuple, Protocol
 
+from needletrack.calibration.drift import DriftParameters, DriftState, doubted
 from needletrack.capture.source import FrameSource
+from needletrack.publish.frames import in_published_frame
 from needletrack.publish.message import (
     Instant,
     RunContext,
@@ -86,9 +88,11 @@ class Service:
         every_frame: bool = False,
         independent: bool = False,
         heartbeat_s: float = 0.5,
+        drift: DriftParameters | None = None,
     ) -> None:
         self._source, self._tracker, self._rig, self._run = source, tracker, rig, run
         self._every_frame, self._independent, self._heartbeat_s = every_frame, independent, heartbeat_s
+        self._drift = drift or DriftParameters()
         self._slot = LatestSlot()
         self._state = ServiceState.STARTING
         self._started_s = time.monotonic()
@@ -111,16 +115,22 @@ class Service:
         started_s = time.monotonic()
         tracking_ms: deque[float] = deque(maxlen=_TIMES_KEPT)
         previous: NeedleTrack | None = None
+        drift = DriftState()
         try:
             for pair, dropped in self._every_pair(stop) if self._every_frame else self._newest_pairs(stop):
                 began_s = time.perf_counter()
                 track = self._tracker(pair, None if self._independent else previous)
                 tracking_ms.append((time.perf_counter() - began_s) * 1e3)
+                # What is published may be doubted; the next pair is tracked from the track itself.
                 previous = track
+                drift = drift.after(track, self._rig, self._drift)
+                if drift.noticed(self._drift):
+                    track = doubted(track)
                 self._statuses[track.status] += 1
                 self._reasons.update(track.reasons)
                 self._last_sequence = pair.sequence
-                message = TrackMessage.from_track(track, pair, self._run, dropped=dropped, published=Instant.now())
+                published = in_published_frame(track, self._rig.registration)
+                message = TrackMessage.from_track(published, pair, self._run, dropped=dropped, published=Instant.now())
                 for sink in sinks:
                     sink.take(pair, track, message)
         finally:

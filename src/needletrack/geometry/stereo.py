@@ -51,6 +51,10 @@ class StereoRig:
         """Raw pixels (N, 2) of points (N, 3) in the left camera's frame, in the left and in the right view."""
         return self.left.project(points_mm), self.right.project(self.right_from_left.apply(points_mm))
 
+    def calibration_covariance_mm2(self, points_mm: npt.ArrayLike) -> Float | None:
+        """Covariance (N, 3, 3) of triangulated points (N, 3) mm that the calibration gives them; None where unknown."""
+        return None
+
     @cached_property
     def rectification(self) -> tuple[Float, Float, Float]:
         """Rotations (3, 3) that turn left and right rays so that epipolar lines are rows, and the common camera matrix.

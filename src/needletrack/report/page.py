@@ -1,10 +1,8 @@
 """The page: every pair tracked as a replay does, the figures of all, the worst ones in full, in one HTML file."""
 
-import os
 import platform
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from importlib.metadata import version
@@ -24,6 +22,7 @@ from needletrack.report.arc import arc_figure
 from needletrack.report.figures import PairFigures, pair_figures
 from needletrack.report.trends import trends_figure
 from needletrack.report.views import ViewPictures, magnification, view_pictures
+from needletrack.report.whole import WholeFile
 from needletrack.report.worst import Worst
 from needletrack.scoring import GREATEST_ERROR_MM, TrueShape, recorded_truth
 from needletrack.service import RunSummary, Sink
@@ -58,7 +57,7 @@ def write_report(
     or not at all. Raises RecordingError where it cannot be written, or the truth cannot be read.
     """
     truth = _truth(replay.recording.folder) if with_truth else None
-    with _Whole(output) as page:
+    with WholeFile(output) as page:
         gathered = _Gathered(most, truth)
         summary = replay.run(stop, sinks=[gathered, *sinks])
         chosen = gathered.worst.chosen()
@@ -90,50 +89,6 @@ def _truth(folder: Path) -> dict[int, TrueShape] | None:
         return recorded_truth(folder)
     except RecordingError as error:
         raise RecordingError(f"{error}; --no-truth leaves it out") from error
-
-
-class _Whole:
-    """A file that appears whole or not at all; opened first, so that ten minutes' work is not done for nothing."""
-
-    def __init__(self, path: Path) -> None:
-        self._path = path
-        self._temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-
-    def __enter__(self) -> "_Whole":
-        if self._path.is_dir():
-            raise RecordingError(f"{self._path}: the report cannot be written: a folder; name a file, e.g. report.html")
-        try:
-            self._file = self._temporary.open("w", encoding="utf-8")
-        except OSError as error:
-            raise self._unwritable(error) from error
-        return self
-
-    def __exit__(self, *raised: object) -> None:
-        with suppress(OSError):
-            self._file.close()
-        with suppress(OSError):
-            self._temporary.unlink()
-
-    def write(self, text: str) -> None:
-        try:
-            self._file.write(text)
-        except OSError as error:
-            raise self._unwritable(error) from error
-
-    def finish(self) -> int:
-        """Give it its name; returns its size."""
-        try:
-            self._file.close()
-            self._temporary.replace(self._path)
-            return self._path.stat().st_size
-        except OSError as error:
-            raise self._unwritable(error) from error
-
-    def _unwritable(self, error: OSError) -> RecordingError:
-        remedy = "name a file in a folder that is there and that you may write to"
-        if isinstance(error, FileNotFoundError):
-            remedy = f"make the folder {self._path.parent} first, or name another"
-        return RecordingError(f"{self._path}: the report cannot be written: {error.strerror or error}: {remedy}")
 
 
 def _pieces(

@@ -109,7 +109,8 @@ class Refined:
     The points of `fit` and of `observed` correspond. tip_px holds the tip as the left and the right view alone place
     it, raw px (2, 2); tip_is_free is false where something crosses there, behind which the needle may go on. log_odds:
     of such a needle over none, both views together; no single section has more than its say. shown (2, N): where each
-    view shows the needle, by its silhouette or by the streak of light on it.
+    view shows the needle, by its silhouette or by the streak of light on it. calibration_mm2 (N, 3, 3): what the
+    calibration leaves open at each point, where that is known.
     """
 
     fit: CurveFit
@@ -122,6 +123,7 @@ class Refined:
     tip_is_free: bool
     tip_px: Float
     log_odds: float
+    calibration_mm2: Float | None = None
 
     @property
     def tip_covariance_mm2(self) -> Float:
@@ -130,6 +132,8 @@ class Refined:
         left, right = self.tip.each_mm
         along_mm = np.hypot(np.sum(np.array(self.tip.sigma_mm) ** -2.0) ** -0.5, abs(left - right) / 2)
         covariance = self.fit.point_covariance_mm2()[-1] + along_mm**2 * np.outer(along, along)
+        if self.calibration_mm2 is not None:
+            covariance = covariance + self.calibration_mm2[-1]
         return np.asarray((covariance + covariance.T) / 2)
 
 

@@ -55,9 +55,11 @@ def judged(refined: Refined, rig: StereoRig, parameters: TrackingParameters, pre
     """The refined curve as a shape with its verdict; raises NeedleNotFound where it cannot be the needle."""
     fit = refined.fit
     seen = refined.shown
+    # One error for all points of all pairs: it does not average out along the needle.
+    refined = replace(refined, calibration_mm2=rig.calibration_covariance_mm2(fit.points_mm))
     curve = NeedleCurve(
         fit.points_mm,
-        _sigma_across_mm(fit),
+        _sigma_across_mm(fit, refined.calibration_mm2),
         seen.sum(axis=0),
         curvature(fit.derivative(1), fit.derivative(2)),
         float(arc_length(fit.points_mm)[-1]),
@@ -114,7 +116,7 @@ def as_track(
         since_detection,
         shape.quality,
         elapsed_ms,
-        replace(evidence, axis_residual_px=fit.residual_px),
+        replace(evidence, axis_residual_px=fit.residual_px, tip_px=None if tip is None else shape.refined.tip_px),
         shape.doubts,
     )
 
@@ -137,11 +139,15 @@ def _tip_direction(points_mm: Float) -> Float:
     return unit(np.linalg.lstsq(design, points_mm[last], rcond=None)[0][1])
 
 
-def _sigma_across_mm(fit: CurveFit) -> Float:
-    """Square root (N,) of the larger eigenvalue of each point's covariance across the tangent."""
+def _sigma_across_mm(fit: CurveFit, calibration_mm2: Float | None) -> Float:
+    """Square root (N,) of the larger eigenvalue of each point's covariance across the tangent.
+
+    calibration_mm2 (N, 3, 3): the calibration's share, where it is known.
+    """
     along = unit(fit.derivative(1))
     across = np.eye(3) - along[:, :, None] * along[:, None, :]
-    flattened = across @ fit.point_covariance_mm2() @ across
+    of_points = fit.point_covariance_mm2()
+    flattened = across @ (of_points if calibration_mm2 is None else of_points + calibration_mm2) @ across
     return np.asarray(np.sqrt(np.maximum(np.linalg.eigvalsh(flattened)[:, -1], 1e-12)))
 
 

@@ -1,0 +1,1 @@
+"""Other tools' calibration files, read as a rig and written from one."""

@@ -57,7 +57,7 @@ def watched(recordings: list[AslRecording], motion: Motion) -> Watched:
             track = track_pair(recording.read(index), rig, None, previous if sequence else None)
             previous, pairs, ok = track, pairs + 1, ok + (track.status is Status.OK)
             state = state.after(track, rig, parameters)
-            if noticed is None and state.noticed(parameters):
+            if noticed is None and state.has_moved:
                 noticed = pairs
     offsets = np.array(state.offsets_px)
     return Watched(pairs, ok, len(offsets), float(np.median(offsets)) if len(offsets) else float("nan"), noticed)

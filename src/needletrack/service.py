@@ -124,7 +124,7 @@ class Service:
                 # What is published may be doubted; the next pair is tracked from the track itself.
                 previous = track
                 drift = drift.after(track, self._rig, self._drift)
-                if drift.noticed(self._drift):
+                if drift.has_moved:
                     track = doubted(track)
                 self._statuses[track.status] += 1
                 self._reasons.update(track.reasons)

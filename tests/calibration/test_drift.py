@@ -165,7 +165,7 @@ def run_through(offset_px: float, sigma_px: float, count: int, seed: int = 2) ->
     for index in range(count):
         at_mm = np.array([random.uniform(-20, 40), random.uniform(-20, 20), random.uniform(230, 280)])
         state = state.after(track_with(offset_px + random.normal(0, sigma_px), rig, at_mm), rig, parameters)
-        if state.noticed(parameters):
+        if state.has_moved:
             return index + 1
     return None
 
@@ -198,3 +198,22 @@ def test_what_is_noticed_is_said_and_nothing_else_changes() -> None:
     assert told.tip is track.tip
     invalid = NeedleTrack(0, Status.INVALID, (Reason.NO_CANDIDATE,))
     assert doubted(invalid) is invalid
+
+
+def test_what_is_noticed_stays_noticed_until_it_is_clearly_gone() -> None:
+    rig, parameters, state = default_rig(), DriftParameters(window_pairs=10, least_pairs=5), DriftState()
+    at_mm = np.array([0.0, 0.0, 250.0])
+
+    def after(offsets_px: list[float]) -> DriftState:
+        now = state
+        for offset_px in offsets_px:
+            now = now.after(track_with(offset_px, rig, at_mm), rig, parameters)
+        return now
+
+    state = after([0.5] * 10)
+    assert state.has_moved
+    # Tips that scatter by more than they are off would not have raised it, and do not end it.
+    state = after([-1.0, 1.4] * 5)
+    assert state.has_moved
+    state = after([0.05] * 10)
+    assert not state.has_moved

@@ -51,9 +51,14 @@ class DriftParameters(BaseModel):
 
 @dataclass(frozen=True, slots=True)
 class DriftState:
-    """The last tips' signed distances from their epipolar lines, px, the newest last: a value, as a track is."""
+    """The last tips' signed distances from their epipolar lines, px, the newest last: a value, as a track is.
+
+    has_moved: whether they lie off their lines, to one side, by more than chance and tips allow. Once they do it takes
+    half of what is tolerated to say that they do no more: an alarm that comes and goes with the noise helps nobody.
+    """
 
     offsets_px: tuple[float, ...] = ()
+    has_moved: bool = False
 
     def after(self, track: NeedleTrack, rig: StereoRig, parameters: DriftParameters) -> "DriftState":
         """The state with one more track; one without a tip in both views adds nothing."""
@@ -62,17 +67,19 @@ class DriftState:
             return self
         left, right = rig.left.undistort(tip_px[[0]]), rig.right.undistort(tip_px[[1]])
         offset = float(epipolar_distance_px(rig.fundamental, left, right)[0])
-        return DriftState((*self.offsets_px, offset)[-parameters.window_pairs :])
+        offsets = (*self.offsets_px, offset)[-parameters.window_pairs :]
+        return DriftState(offsets, _moved(np.array(offsets), parameters, already=self.has_moved))
 
-    def noticed(self, parameters: DriftParameters) -> bool:
-        """Whether the tips lie off their lines, to one side, by more than chance and tips allow."""
-        if len(self.offsets_px) < parameters.least_pairs:
-            return False
-        offsets = np.array(self.offsets_px)
-        median = float(np.median(offsets))
-        spread = _MAD_SIGMA * float(np.median(np.abs(offsets - median)))
-        error = _MEDIAN_ERROR * spread / np.sqrt(len(offsets))
-        return bool(abs(median) > max(parameters.max_offset_px, parameters.clear_sigmas * error))
+
+def _moved(offsets_px: Float, parameters: DriftParameters, *, already: bool) -> bool:
+    if len(offsets_px) < parameters.least_pairs:
+        return False
+    median = float(np.median(offsets_px))
+    if already:
+        return abs(median) > parameters.max_offset_px / 2
+    spread = _MAD_SIGMA * float(np.median(np.abs(offsets_px - median)))
+    error = float(_MEDIAN_ERROR * spread / np.sqrt(len(offsets_px)))
+    return abs(median) > max(parameters.max_offset_px, parameters.clear_sigmas * error)
 
 
 def doubted(track: NeedleTrack) -> NeedleTrack:

@@ -34,6 +34,8 @@ FLOORS: dict[str, float] = {
     "__init__": 5.1,
     "terminal": 5.2,
     "replay": 5.2,
+    "daemon": 5.2,
+    "doctor": 5.25,
     "demo": 5.3,
     "report": 5.3,
     "cli": 5.4,

@@ -105,7 +105,7 @@ class DaemonConfig(BaseModel):
     )
     lock_memory: bool = Field(True, description="Keep all memory resident.")
     cpus: tuple[Annotated[int, Ge(0)], ...] = Field(
-        (), description="Processors that capture and tracking run on; empty: any. The recorder takes the others."
+        (), description="Processors that capture and tracking run on; empty: any."
     )
     metrics_port: Annotated[int, Ge(0), Le(65535)] = Field(
         9464, description="Prometheus metrics on this port of 127.0.0.1; 0: none."

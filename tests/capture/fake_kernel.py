@@ -3,6 +3,7 @@
 import errno
 import os
 import select
+import time
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from ctypes import Structure, c_int
@@ -74,7 +75,7 @@ class FakeCamera:
         self.reset()
 
     def reset(self) -> None:
-        self.format = (abi.fourcc("GREY"), 8, 4)
+        self.format = (abi.fourcc("GREY"), *self.formats.get("GREY", [(8, 4)])[0])
         self.buffers: list[bytearray] = []
         self.queued: deque[int] = deque()
         self.done: deque[abi.Buffer] = deque()
@@ -280,3 +281,51 @@ class ScriptStop(Event):
         if not self.is_set():
             self._kernel.step(timeout or 0.0)
         return self.is_set()
+
+
+class RunningKernel(FakeKernel):
+    """Two cameras that run in real time, in step, stamped with the machine's monotonic clock.
+
+    pictures: the nth pair's buffers, or None for none now; a pair comes at most `rate_hz` times a second.
+    """
+
+    def __init__(
+        self,
+        cameras: Sequence[FakeCamera],
+        pictures: Callable[[int], tuple[bytes, bytes] | None],
+        rate_hz: float = 50.0,
+        skew_us: int = 40,
+    ) -> None:
+        super().__init__(cameras)
+        self._pictures, self._period_s, self._skew_us = pictures, 1 / rate_hz, skew_us
+        self._due_s = 0.0
+        self.delivered = 0
+        self.stamps_us: list[int] = []
+
+    def step(self, waited_s: float) -> None:
+        time.sleep(min(waited_s, max(self._due_s - time.monotonic(), 0.001)))
+        if time.monotonic() < self._due_s or not all(camera.streaming for camera in self.cameras):
+            return
+        pictures = self._pictures(self.delivered)
+        if pictures is None:
+            return
+        self._due_s = time.monotonic() + self._period_s
+        stamp_us = time.monotonic_ns() // 1000
+        for number, camera in enumerate(self.cameras):
+            camera.deliver(stamp_us + number * self._skew_us, pictures[number])
+        self.delivered += 1
+        self.stamps_us.append(stamp_us)
+
+
+def two_cameras(size_px: tuple[int, int], rate_hz: float = 50.0) -> list[FakeCamera]:
+    """A left and a right camera of a size, on two sockets of a bus."""
+    return [
+        FakeCamera(
+            f"/dev/video{n}",
+            f"usb-{n + 1}",
+            formats={"GREY": [size_px]},
+            rates_hz=(rate_hz,),
+            stride=size_px[0],
+        )
+        for n in range(2)
+    ]

@@ -39,7 +39,7 @@ def examined(
 ) -> dict[str, Finding]:
     """Findings by subject; of several of a subject the worst."""
     known = rig or calibrated()
-    usual = {"recording": {"folder": tmp_path}, "cameras": {"exposure_us": 4000.0}}
+    usual: dict[str, dict[str, Any]] = {"recording": {"folder": tmp_path}, "cameras": {"exposure_us": 4000.0}}
     config = config_for(known, **{name: {**usual.get(name, {}), **tables.get(name, {})} for name in usual | tables})
     kernel = RunningKernel(fakes or two_cameras(SIZE_PX), lambda number: (picture, picture), skew_us=skew_us)
     found: dict[str, Finding] = {}

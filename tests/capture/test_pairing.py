@@ -18,7 +18,7 @@ PERIOD_NS = 10 * MS
 
 
 def run(
-    frames: Sequence[tuple[Side, int]], tolerance_ns: int, *, offset_ns: int = 0, period_ns: int = 0
+    frames: Sequence[tuple[Side, int]], tolerance_ns: int, *, offset_ns: int = 0, period_ns: int | None = 0
 ) -> tuple[list[tuple[int, int]], list[tuple[DropReason, int]]]:
     """Pairs and losses of frames in the order of their arrival; a frame is its own stamp."""
     pairer: StampPairer[int] = StampPairer(tolerance_ns, offset_ns=offset_ns, period_ns=period_ns)
@@ -90,6 +90,23 @@ def test_a_pair_is_given_with_its_second_frame() -> None:
     pairer: StampPairer[str] = StampPairer(MS, period_ns=9 * MS)
     assert list(pairer.add("left", 0, "l0")) == []
     assert list(pairer.add("right", 200 * US, "r0")) == [Paired("l0", "r0")]
+
+
+@pytest.mark.parametrize("skew_ns", [0, 200 * US, -800 * US])
+def test_where_no_rate_is_configured_a_pair_does_not_wait_for_the_next_frame_either(skew_ns: int) -> None:
+    pairer: StampPairer[int] = StampPairer(MS)
+    for n in range(5):
+        first, second = sorted([("left", n * PERIOD_NS), ("right", n * PERIOD_NS + skew_ns)], key=lambda each: each[1])
+        assert list(pairer.add(*first, n)) == []  # type: ignore[arg-type]
+        assert list(pairer.add(*second, n)) == [Paired(n, n)]  # type: ignore[arg-type]
+
+
+@given(jitters, losses, losses)
+def test_a_learnt_period_pairs_as_a_known_one(jitter: list[int], lost_left: set[int], lost_right: set[int]) -> None:
+    left = [n * PERIOD_NS for n in range(len(jitter)) if n not in lost_left]
+    right = [n * PERIOD_NS + jitter[n] for n in range(len(jitter)) if n not in lost_right]
+    known = run(arriving(left, right), MS, period_ns=PERIOD_NS * 9 // 10)
+    assert run(arriving(left, right), MS, period_ns=None) == known
 
 
 def test_the_nearer_of_two_is_waited_for_where_the_first_is_beyond_half_a_period() -> None:

@@ -22,8 +22,8 @@ SIDES: tuple[Side, Side] = ("left", "right")
 _POLL_S = 0.1
 # A camera that comes back is to deliver within 2 s; a USB one takes most of a second to answer.
 _RETRY_S = 0.25
-# After so long without a frame the stream is started anew: some drivers never wake up by themselves.
-_RESTART_STALLED_AFTER_S = 3.0
+# After so many times `stall_s` the stream is started anew: some drivers never wake up by themselves.
+_RESTART_AFTER_STALLS = 6
 _RATE_OVER = 60
 _NS = 1_000_000_000
 # A frame that is late by a tenth of the period is still of its period.
@@ -182,7 +182,7 @@ class LiveSource:
 
     def _streamed(self, streams: dict[Side, _Stream], stop: Event) -> Iterator[StereoPair]:
         rate_hz = self._settings.rate_hz
-        period_ns = round(_NS / rate_hz * _SHORTEST_PERIOD) if rate_hz else 0
+        period_ns = round(_NS / rate_hz * _SHORTEST_PERIOD) if rate_hz else None
         pairer: StampPairer[_Arrived] = StampPairer(self._tolerance_ns, offset_ns=self._offset_ns, period_ns=period_ns)
         sides = {stream.camera.descriptor: side for side, stream in streams.items()}
         try:
@@ -258,7 +258,7 @@ class LiveSource:
         now_s = self._monotonic()
         for side, stream in streams.items():
             silent_s = now_s - stream.last_frame_s
-            if silent_s > _RESTART_STALLED_AFTER_S:
+            if silent_s > _RESTART_AFTER_STALLS * self._settings.stall_s:
                 raise CameraUnavailable(f"{stream.camera} has sent nothing for {silent_s:.1f} s: it is started anew")
             if silent_s > self._settings.stall_s and not stream.stalled:
                 stream.stalled = True

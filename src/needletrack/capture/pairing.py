@@ -17,6 +17,9 @@ _OTHER: dict[Side, Side] = {"left": "right", "right": "left"}
 UNPAIRED: dict[Side, DropReason] = {"left": DropReason.UNPAIRED_LEFT, "right": DropReason.UNPAIRED_RIGHT}
 # A camera that has nothing yet for so many frames of the other will have nothing for the first of them.
 _MOST_WAITING = 6
+# A frame that is early by a tenth of the period is still of its period.
+_SHORTEST_PERIOD = 0.9
+_INTERVALS_REMEMBERED = 32
 # A stamp far ahead must cost its own frame, not all that follow: after so many, they are believed.
 _BELIEVED_AFTER = 3
 
@@ -42,15 +45,17 @@ class StampPairer(Generic[T]):
 
     offset_ns: what the right stamp of an instant is later than the left one by the nature of the cameras. period_ns:
     the least time between two frames of one camera; two stamps within half of it are each other's nearest, so that
-    their pair is given at once, without a look at the next frame. Every frame comes out once, in a pair or unpaired.
+    their pair is given at once, without a look at the next frame. None: it is learnt from the stamps. Every frame comes
+    out once, in a pair or unpaired.
     """
 
-    def __init__(self, tolerance_ns: int, *, offset_ns: int = 0, period_ns: int = 0) -> None:
+    def __init__(self, tolerance_ns: int, *, offset_ns: int = 0, period_ns: int | None = None) -> None:
         self._tolerance_ns, self._period_ns = tolerance_ns, period_ns
         self._shift_ns: dict[Side, int] = {"left": 0, "right": -offset_ns}
         self._waiting: dict[Side, deque[tuple[int, T]]] = {"left": deque(), "right": deque()}
         self._newest: dict[Side, int | None] = {"left": None, "right": None}
         self._disordered: dict[Side, int] = {"left": 0, "right": 0}
+        self._intervals_ns: deque[int] = deque(maxlen=_INTERVALS_REMEMBERED)
 
     def add(self, side: Side, stamp_ns: int, frame: T) -> Iterator[Paired[T] | Unpaired[T]]:
         """Take a frame, and give every pair and every loss that is decided by it, in order."""
@@ -61,6 +66,8 @@ class StampPairer(Generic[T]):
                 yield Unpaired(DropReason.STAMP_OUT_OF_ORDER, frame)
                 return
             yield from self._lose_all(side)
+        elif newest is not None:
+            self._intervals_ns.append(stamp_ns - newest)
         self._disordered[side] = 0
         self._newest[side] = stamp_ns
         self._waiting[side].append((stamp_ns + self._shift_ns[side], frame))
@@ -89,9 +96,15 @@ class StampPairer(Generic[T]):
                 if abs(later_ns - rivals[1][0]) < abs(apart_ns):
                     yield self._lose_first(earlier)
                     continue
-            elif 2 * abs(apart_ns) > self._period_ns and apart_ns != 0:
-                return  # the earlier camera's next frame may be nearer
+            elif self._next_may_be_nearer(abs(apart_ns)):
+                return
             yield Paired(left.popleft()[1], right.popleft()[1])
+
+    def _next_may_be_nearer(self, apart_ns: int) -> bool:
+        """Whether the earlier camera's next frame could be nearer than this one, which is so far away."""
+        if self._period_ns is not None:
+            return apart_ns > 0 and 2 * apart_ns > self._period_ns
+        return bool(self._intervals_ns) and 2 * apart_ns > _SHORTEST_PERIOD * min(self._intervals_ns)
 
     def _lose_first(self, side: Side) -> Unpaired[T]:
         return Unpaired(UNPAIRED[side], self._waiting[side].popleft()[1])

@@ -150,7 +150,8 @@ class Recorder:
         fits = pair.left.image.shape == pair.right.image.shape == self._shape[1:]
         if self._closed or not self._free or not fits or not self._process.is_alive():
             self.dropped += 1
-            self._warn("the disk is too slow" if not self._free else "the recorder has ended")
+            alive = self._process.is_alive()
+            self._warn((self._state.error or "the disk is too slow") if alive else "the recorder has ended")
             return False
         slot = self._free.popleft()
         np.copyto(self._slots[slot, 0], pair.left.image)
@@ -390,7 +391,9 @@ class _Files:
             write(self._writer)
             self._sync(now_s)
         except RecordingError as error:
-            self._pause(str(error))
+            # The folder: a name that changes with every attempt would be told as news each time.
+            cause = error.__cause__
+            self._pause(_unwritable(self._folder(), cause) if isinstance(cause, OSError) else str(error))
             return False
         except OSError as error:
             if self._writer is not None:

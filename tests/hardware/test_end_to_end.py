@@ -30,7 +30,7 @@ STEER = ROOT / "tests" / "data" / "recordings" / "steer-b"
 ENDPOINT = "tcp/127.0.0.1:7457"
 PAIRS, SKEW_US = 4, 250
 # The guest's processor is emulated, and a Python process takes half a minute to start: only a hang takes so long.
-WAIT_S = 120.0
+WAIT_S = 150.0
 OF_THE_RUN = ("run_id", "published_at_ns", "timing_ms", "latency_ms", "captured_at_unix_ns", "source", "clock")
 CONFIG = """
 [rig]
@@ -63,7 +63,7 @@ def wait_for(condition: Callable[[], bool]) -> None:
 @contextmanager
 def daemon(config: Path) -> Iterator[subprocess.Popen[bytes]]:
     command = [sys.executable, "-m", "needletrack", "run", "--config", str(config)]
-    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+    environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONFAULTHANDLER": "1"}
     with subprocess.Popen(command, env=environment, cwd=ROOT) as process:
         try:
             yield process

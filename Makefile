@@ -48,7 +48,8 @@ test-slow: $(INSTALLED)  ## the tests marked slow
 
 # The emulator's AVX2 is not to be trusted: NumPy's exp of float32 dies of it.
 test-hardware: $(INSTALLED)  ## the tests on the kernel's test cameras, in a guest (root, Debian 12, apt)
-	tests/hardware/guest.sh --loopback 2 --cpu Nehalem --timeout 1200 -- $(BIN)/python -m pytest -q -p no:cacheprovider tests/hardware
+	OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 OPENCV_FOR_THREADS_NUM=1 \
+	  tests/hardware/guest.sh --loopback 2 --cpu Nehalem --timeout 1200 -- $(BIN)/python -m pytest -q -p no:cacheprovider tests/hardware
 
 lint: $(INSTALLED)  ## ruff and hadolint
 	$(BIN)/ruff check --output-format concise .

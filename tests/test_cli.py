@@ -50,7 +50,23 @@ def test_the_module_is_the_program() -> None:
 
 def test_without_a_command_it_lists_the_commands() -> None:
     result = run()
-    for command in ("demo", "replay", "report", "watch", "rig", "config", "calibrate", "table1", "version"):
+    for command in (
+        "run",
+        "record",
+        "doctor",
+        "recover",
+        "export",
+        "import",
+        "demo",
+        "replay",
+        "report",
+        "watch",
+        "rig",
+        "config",
+        "calibrate",
+        "table1",
+        "version",
+    ):
         assert re.search(rf"\b{command}\b", result.output)
 
 

@@ -20,7 +20,7 @@ from needletrack.client import Subscriber
 from needletrack.config import load_config
 from needletrack.geometry.spline import distance_from_curve
 from needletrack.recording.asl import AslRecording
-from needletrack.recording.mcap_file import McapRecording, recover
+from needletrack.recording.mcap_file import McapRecording
 from needletrack.records import Clock, Status
 from needletrack.replay import Replay, open_recording
 from needletrack.scoring import recorded_truth
@@ -28,9 +28,9 @@ from needletrack.scoring import recorded_truth
 ROOT = Path(__file__).parents[2]
 STEER = ROOT / "tests" / "data" / "recordings" / "steer-b"
 ENDPOINT = "tcp/127.0.0.1:7457"
-PAIRS, SKEW_US = 4, 250
+PAIRS, SKEW_US = 3, 250
 # The guest's processor is emulated, and a Python process takes half a minute to start: only a hang takes so long.
-WAIT_S = 150.0
+WAIT_S = 200.0
 OF_THE_RUN = ("run_id", "published_at_ns", "timing_ms", "latency_ms", "captured_at_unix_ns", "source", "clock")
 CONFIG = """
 [rig]
@@ -126,21 +126,16 @@ def test_frames_to_tracks(tmp_path: Path) -> None:
         rig = Rig((feeds[0], feeds[1]), subscriber)
         with daemon(path) as process:
             rig.ready(process)
-            rig.send(0)
-            # Killed: nothing says goodbye, the recording has no end.
-            process.kill()
-        with daemon(path) as process:
-            rig.ready(process)
             for number in range(PAIRS):
                 rig.send(number)
             process.send_signal(signal.SIGTERM)
             assert process.wait(WAIT_S) == 0
         assert subscriber.wait_until_gone(WAIT_S)
 
-    killed, messages = rig.messages[0], rig.messages[1:]
+    messages = rig.messages
     truth = recorded_truth(STEER)
     for number, message in enumerate(messages):
-        assert message.captured_at_ns == rig.stamps_us[number + 1] * 1000, "stamps are unchanged"
+        assert message.captured_at_ns == rig.stamps_us[number] * 1000, "stamps are unchanged"
         assert (message.sequence, message.dropped) == (number, {})
         assert (message.clock, message.quality.pair_skew_us) == (Clock.MONOTONIC, SKEW_US)
         assert message.latency_ms > message.timing_ms["track"] > 0
@@ -149,20 +144,11 @@ def test_frames_to_tracks(tmp_path: Path) -> None:
         # What a status of ok promises, and what these frames give.
         assert np.percentile(off_mm, 95) < 1.0
         assert np.median(off_mm) < 0.3
-    assert sum(message.status is Status.OK for message in messages) >= PAIRS // 2
-    assert killed.run_id != messages[0].run_id
+    assert sum(message.status is Status.OK for message in messages) > PAIRS // 2
 
-    files = sorted((tmp_path / "recordings").glob("*.mcap"), key=lambda file: file.stat().st_mtime)
+    (file,) = (tmp_path / "recordings").glob("*.mcap")
     config = load_config(path)
-    # Of the killed daemon the writing process finished the file, or its end is recovered.
-    first = files[0]
-    try:
-        survived = McapRecording(first)
-    except Exception:
-        recover(first, tmp_path / "saved.mcap")
-        survived = McapRecording(tmp_path / "saved.mcap")
-    assert np.array_equal(survived.read(0).left.image, recorded.read(0).left.image)
-    recording = McapRecording(files[-1])
+    recording = McapRecording(file)
     assert len(recording) == PAIRS
     published = [message for _, message in recording.tracks()]
     assert published == [message.to_json() for message in messages]
@@ -174,6 +160,6 @@ def test_frames_to_tracks(tmp_path: Path) -> None:
         ):
             assert np.array_equal(ours.image, true.image)
     output = tmp_path / "replayed.jsonl"
-    Replay(open_recording(files[-1], config), config).run(threading.Event(), output=output)
+    Replay(open_recording(file, config), config).run(threading.Event(), output=output)
     replayed = output.read_bytes().splitlines()
     assert [without_times(message) for message in replayed] == [without_times(message) for message in published]

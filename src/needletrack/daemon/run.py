@@ -209,13 +209,16 @@ class _Pulse:
 
     def _beat(self) -> None:
         every_s = min(self._notifier.watchdog_s / 2 or _STATUS_EVERY_S, _STATUS_EVERY_S)
+        told = False
         while not self._stop.wait(every_s):
             silent_s = time.monotonic() - self._cameras.alive_at_s
             if max(silent_s, self._service.busy_s) < _STUCK_AFTER_S:
                 states = ", ".join(f"{side} {health.state.value}" for side, health in self._cameras.health.items())
                 self._notifier.alive(f"cameras: {states}; {sum(self._service.statuses.values())} pairs tracked")
-            else:
-                _log.error("stuck: capture %.1f s, tracking %.1f s", silent_s, self._service.busy_s)
+                told = False
+            elif not told:
+                _log.error("stuck: capture for %.1f s, tracking for %.1f s", silent_s, self._service.busy_s)
+                told = True
 
 
 def tracker_of(rig: Rig, config: Config) -> Tracker:

@@ -41,6 +41,7 @@ _LOOK_AT_DISK_EVERY_S = 1.0
 _RETRY_AFTER_S = 5.0
 _WARN_EVERY_S = 5.0
 _MB = 1_000_000
+_NICE = -10
 # <malloc.h>
 _M_TRIM_THRESHOLD, _M_TOP_PAD, _M_MMAP_THRESHOLD = -1, -2, -3
 
@@ -273,7 +274,9 @@ def _record(
         signal.signal(number, signal.SIG_IGN)
     with suppress(OSError):
         os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
-        os.nice(5)
+    # It needs little, and that at once: among others' jobs on a busy machine it lost half of the pairs.
+    with suppress(OSError):
+        os.nice(_NICE)
     _keep_freed_memory()
     memory = SharedMemory(memory_name)
     slots: Any = np.ndarray(shape, np.uint8, memory.buf)

@@ -12,6 +12,7 @@ from tests.daemon.test_run import config_for, free_port
 from tests.recording.small_recording import SIZE_PX, small_rig
 from typer.testing import CliRunner
 
+from needletrack import doctor
 from needletrack.cli import app
 from needletrack.config import Config
 from needletrack.daemon.process import OnlyInstance
@@ -21,6 +22,11 @@ from needletrack.publish.session import open_session
 from needletrack.rig import CalibrationInfo, Rig
 
 GRAY = bytes([120]) * (SIZE_PX[0] * SIZE_PX[1])
+
+
+@pytest.fixture(autouse=True)
+def _small_disk_test(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(doctor, "_DISK_TEST_MB", 8)
 
 
 def calibrated(days_ago: float = 1) -> Rig:
@@ -44,7 +50,7 @@ def examined(
     kernel = RunningKernel(fakes or two_cameras(SIZE_PX), lambda number: (picture, picture), skew_us=skew_us)
     found: dict[str, Finding] = {}
     order = [Verdict.PASS, Verdict.WARN, Verdict.FAIL]
-    for finding in examine(config, lambda: known, seconds=0.9, kernel=kernel):
+    for finding in examine(config, lambda: known, seconds=0.8, kernel=kernel):
         known_worst = found.get(finding.subject)
         if known_worst is None or order.index(finding.verdict) > order.index(known_worst.verdict):
             found[finding.subject] = finding

@@ -12,7 +12,7 @@ CODE = $(wildcard src tests tools benchmarks)
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help env demo test test-slow lint format types bench bench-smoke accuracy accuracy-page peers table1 schema lock clean
+.PHONY: help env demo test test-slow test-hardware lint format types bench bench-smoke soak accuracy accuracy-page peers table1 schema lock clean
 
 help:  ## list the targets
 	@awk -F ':.*## ' '/^[a-z0-9-]+:.*## / { printf "  make %-12s %s\n", $$1, $$2 }' Makefile
@@ -46,6 +46,11 @@ test: $(INSTALLED)  ## the quick tests, with coverage
 test-slow: $(INSTALLED)  ## the tests marked slow
 	@$(BIN)/python -m pytest -m slow || { code=$$?; [ $$code -eq 5 ] && echo "No test is marked slow." || exit $$code; }
 
+# The emulator's AVX2 is not to be trusted: NumPy's exp of float32 dies of it.
+test-hardware: $(INSTALLED)  ## the tests on the kernel's test cameras, in a guest (root, Debian 12, apt)
+	OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 OPENCV_FOR_THREADS_NUM=1 \
+	  tests/hardware/guest.sh --loopback 2 --cpu Nehalem --timeout 1200 -- $(BIN)/python -m pytest -q -p no:cacheprovider tests/hardware
+
 lint: $(INSTALLED)  ## ruff and hadolint
 	$(BIN)/ruff check --output-format concise .
 	$(BIN)/ruff format --check .
@@ -63,6 +68,9 @@ bench: $(INSTALLED)  ## time per stage and pair, throughput, memory, ratio to th
 
 bench-smoke: $(INSTALLED)  ## the same on a few pairs: does the benchmark still run?
 	@$(BIN)/python -m benchmarks --smoke
+
+soak: $(INSTALLED)  ## ten minutes of the live loop at 60 pairs/s with a recorder (make soak ARGS="--minutes 1")
+	@$(BIN)/python -m benchmarks.live $(ARGS)
 
 accuracy: $(INSTALLED)  ## errors against exact truth, beside other methods (make accuracy ARGS="--peers RECORDING ...")
 	@$(BIN)/python -m benchmarks.accuracy $(ARGS)

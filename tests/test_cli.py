@@ -52,6 +52,12 @@ def test_the_module_is_the_program() -> None:
 def test_without_a_command_it_lists_the_commands() -> None:
     result = run()
     for command in (
+        "run",
+        "record",
+        "doctor",
+        "recover",
+        "export",
+        "import",
         "demo",
         "replay",
         "report",

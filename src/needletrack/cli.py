@@ -17,13 +17,17 @@ import typer
 from rich.console import Console
 
 from needletrack import __version__
-from needletrack.errors import CalibrationError, NeedletrackError
+from needletrack.errors import CalibrationError, NeedletrackError, RecordingError
 from needletrack.publish.keys import DEFAULT_PREFIX
 from needletrack.publish.session import DEFAULT_ENDPOINT
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from needletrack.calibration.board import Board
     from needletrack.calibration.bundle import Terms
+    from needletrack.config import Config
+    from needletrack.records import DropReason
     from needletrack.rig import Rig
 
 # What loads NumPy, SciPy and OpenCV is imported by the commands themselves: they read these variables when
@@ -49,7 +53,7 @@ app.add_typer(config_app, name="config")
 P = ParamSpec("P")
 
 Recording = Annotated[
-    Path, typer.Argument(metavar="RECORDING", help="Folder in the EuRoC/ASL layout (docs/recordings.md).")
+    Path, typer.Argument(metavar="RECORDING", help="Folder in the EuRoC/ASL layout, file of `record`, or ROS bag.")
 ]
 ConfigFile = Annotated[Path | None, typer.Option("--config", help="TOML file (docs/configuration.md).")]
 RigFile = Annotated[
@@ -200,6 +204,144 @@ def report(
     size_mb = written.size_bytes / 1e6
     typer.echo(f"written: {written.path}, {size_mb:.1f} MB, {written.shown} of {written.run.pairs} pairs in full")
     raise typer.Exit(interruption.exit_code or (0 if written.run.pairs else 1))
+
+
+RunRig = Annotated[
+    Path | None, typer.Option("--rig", help="Rig file, camchain, or folder; else rig.path of the configuration.")
+]
+
+
+@app.command()
+def run(rig: RunRig = None, config: ConfigFile = None) -> None:
+    """Track both cameras and publish, until SIGTERM or Ctrl-C: the daemon.
+
+    Exit codes: 0 it was asked to stop; 1 a defect; 2 configuration, rig, endpoint or folder cannot be used; 3 a camera
+    does not do what is configured, or may not be opened; 4 a daemon of the rig runs already.
+    """
+    from needletrack.config import load_config
+    from needletrack.daemon.logs import configure_logs
+    from needletrack.daemon.run import Daemon, exit_code
+    from needletrack.terminal import Interruption, described_skew
+    from needletrack.terminal import described as described_run
+
+    try:
+        effective = load_config(config)
+        daemon = Daemon(_rig_for(rig, effective), effective)
+        configure_logs({"rig": daemon.rig.name, "run_id": daemon.context.run_id})
+        with Interruption() as interruption:
+            summary = daemon.run(interruption.stop)
+    except NeedletrackError as error:
+        _complain(error)
+        raise typer.Exit(exit_code(error)) from error
+    typer.echo(described_run(summary.run), err=True)
+    typer.echo(described_skew(summary.skew), err=True)
+    if summary.recorded is not None:
+        typer.echo(f"  recorded: {summary.recorded} pairs, not recorded: {summary.unrecorded}", err=True)
+
+
+@app.command()
+@plain_errors
+def record(
+    output: Annotated[Path, typer.Argument(metavar="FILE", help="The recording to write, e.g. board.mcap.")],
+    rig: RunRig = None,
+    config: ConfigFile = None,
+    seconds: Annotated[float | None, typer.Option(min=0, help="For so long; else until Ctrl-C.")] = None,
+    pairs: Annotated[int | None, typer.Option(min=1, help="So many pairs.")] = None,
+) -> None:
+    """Record both cameras, without tracking; a rig is put into the file, and not needed for it."""
+    from needletrack.config import load_config
+    from needletrack.daemon.record import record as recorded
+    from needletrack.terminal import Interruption, described_skew, warnings_shown
+
+    effective = load_config(config)
+    known = _rig_for(rig, effective) if rig is not None or effective.rig.path is not None else None
+    with Interruption() as interruption, warnings_shown(Console(stderr=True)):
+        done = recorded(effective, output, interruption.stop, rig=known, seconds=seconds, pairs=pairs)
+    typer.echo(
+        f"{output}: {done.pairs} pairs in {done.duration_s:.1f} s, {done.megabytes:.1f} MB; "
+        f"{done.unrecorded} not recorded; frames lost: {_counts(done.dropped)}",
+        err=True,
+    )
+    typer.echo(described_skew(done.skew), err=True)
+    raise typer.Exit(interruption.exit_code or (0 if done.pairs else 1))
+
+
+@app.command()
+@plain_errors
+def recover(
+    damaged: Annotated[Path, typer.Argument(metavar="FILE", help="A recording that was cut off.")],
+    output: Annotated[Path, typer.Argument(metavar="OUTPUT", help="The file to write.")],
+) -> None:
+    """Save what is whole of a recording that was cut off, by a power cut or a SIGKILL."""
+    from needletrack.recording.mcap_file import recover as recovered
+
+    saved = recovered(damaged, output)
+    typer.echo(
+        f"{output}: {saved.pairs} pairs, {saved.tracks} tracks; {saved.lost_bytes} bytes at the end were not whole"
+    )
+
+
+@app.command()
+@plain_errors
+def export(
+    recording: Recording,
+    output: Annotated[Path, typer.Argument(metavar="FOLDER", help="The folder to write.")],
+    to: Annotated[Literal["asl", "ros2"], typer.Option(help="EuRoC/ASL folders with PNG, or a ROS 2 bag.")] = "asl",
+    rig: RigFile = None,
+) -> None:
+    """Write any recording as folders of images, or as a ROS 2 bag."""
+    from needletrack.recording.stored import export as exported
+    from needletrack.replay import rig_at
+
+    written = exported(recording, output, to, None if rig is None else rig_at(rig))
+    for sentence in written.left_out:
+        typer.echo(f"left out: {sentence}", err=True)
+    typer.echo(f"{written.path}: {written.pairs} pairs")
+
+
+@app.command("import")
+@plain_errors
+def import_recording(
+    recording: Annotated[Path, typer.Argument(metavar="RECORDING", help="ROS bag (1 or 2), or an ASL folder.")],
+    output: Annotated[Path, typer.Argument(metavar="FILE", help="The recording to write, e.g. lab.mcap.")],
+    rig: Annotated[Path, typer.Option(help="The rig that it was taken with, which goes into the file.")],
+    left: Annotated[str | None, typer.Option(help="Topic of the left images, where the names do not tell.")] = None,
+    right: Annotated[str | None, typer.Option(help="Topic of the right images.")] = None,
+    tolerance_us: Annotated[float, typer.Option(min=0, help="As pairing.tolerance_us.")] = 1000.0,
+) -> None:
+    """Make a recording of a ROS bag with two topics of images."""
+    from needletrack.recording.stored import import_recording as imported
+    from needletrack.replay import rig_at
+
+    if (left is None) != (right is None):
+        raise RecordingError("--left and --right go together")
+    topics = None if left is None or right is None else (left, right)
+    written = imported(recording, output, rig_at(rig), topics=topics, tolerance_us=tolerance_us)
+    for sentence in written.left_out:
+        typer.echo(f"left out: {sentence}", err=True)
+    typer.echo(f"{written.path}: {written.pairs} pairs")
+
+
+@app.command()
+@plain_errors
+def doctor(
+    rig: RunRig = None,
+    config: ConfigFile = None,
+    seconds: Annotated[float, typer.Option(min=0.1, help="Let the cameras stream for so long.")] = 2.0,
+) -> None:
+    """Look at cameras, rights, disk, clock, rig and endpoints; each line passes, warns or fails, with the remedy.
+
+    Exit code 1 where something fails.
+    """
+    from needletrack.config import load_config
+    from needletrack.doctor import Verdict, examine
+
+    effective = load_config(config)
+    failed = False
+    for finding in examine(effective, lambda: _rig_for(rig, effective), seconds=seconds):
+        typer.echo(finding)
+        failed |= finding.verdict is Verdict.FAIL
+    raise typer.Exit(1 if failed else 0)
 
 
 @app.command()
@@ -512,6 +654,19 @@ def _board(squares: str, square_mm: float, marker_mm: float | None, dictionary: 
 
 def _rig_name(folder: Path) -> str:
     return re.sub(r"[^A-Za-z0-9._-]+", "-", folder.resolve().name).strip("-._") or "rig"
+
+
+def _rig_for(path: Path | None, config: "Config") -> "Rig":
+    from needletrack.replay import rig_at
+
+    chosen = path or config.rig.path
+    if chosen is None:
+        raise CalibrationError("no rig: name one with --rig, or rig.path in the configuration")
+    return rig_at(chosen)
+
+
+def _counts(counts: "Mapping[DropReason, int]") -> str:
+    return ", ".join(f"{reason.value} {count}" for reason, count in counts.items()) or "none"
 
 
 def _parsed(squares: str) -> tuple[int, int]:

@@ -39,6 +39,8 @@ FRAME_DROPS = frozenset(
         DropReason.UNPAIRED_RIGHT,
         DropReason.STAMP_OUT_OF_ORDER,
         DropReason.MISSING_IMAGE,
+        DropReason.LOST_BY_DRIVER,
+        DropReason.BUFFER_ERROR,
     }
 )
 

@@ -13,7 +13,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any
 
-from annotated_types import Gt, Le
+from annotated_types import Ge, Gt, Le
 from pydantic import (
     AfterValidator,
     AllowInfNan,
@@ -26,6 +26,7 @@ from pydantic import (
 from pydantic_settings import BaseSettings, EnvSettingsSource, SettingsConfigDict, SettingsError
 
 from needletrack.calibration.drift import DriftParameters
+from needletrack.capture.settings import CamerasSettings
 from needletrack.errors import ConfigError
 from needletrack.tracking.parameters import TrackingParameters
 from needletrack.validation import complaints, known_keys, nearest_key
@@ -72,6 +73,45 @@ class PairingConfig(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     tolerance_us: Positive = Field(1000.0, description="Greatest difference of the two stamps of a pair, microseconds.")
+    offset_us: Annotated[float, AllowInfNan(False)] = Field(
+        0.0,
+        description="Right stamps of triggered cameras are this much later for one instant, microseconds.",
+    )
+
+
+class RecordingConfig(BaseModel):
+    """Where recordings go, and how much they may take."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    folder: OptionalPath = Field(
+        None, description="`needletrack run` records everything into this folder; empty: nothing is recorded."
+    )
+    buffer_mb: Annotated[int, Ge(16)] = Field(
+        256,
+        description="Memory between cameras and disk, MB: what the disk may fall behind by before pairs are dropped.",
+    )
+    min_free_mb: Annotated[int, Ge(0)] = Field(
+        1000, description="Recording pauses while the disk has less free than this, MB."
+    )
+    max_file_mb: Annotated[int, Ge(16)] = Field(8000, description="A new file is begun after so much, MB.")
+
+
+class DaemonConfig(BaseModel):
+    """How `needletrack run` lives on its machine; what is not permitted is left out with a warning."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    realtime_priority: Annotated[int, Ge(0), Le(90)] = Field(
+        50, description="SCHED_FIFO priority of capture, tracking has one less; 0: ordinary scheduling."
+    )
+    lock_memory: bool = Field(True, description="Keep all memory resident.")
+    cpus: tuple[Annotated[int, Ge(0)], ...] = Field(
+        (), description="Processors that capture and tracking run on; empty: any."
+    )
+    metrics_port: Annotated[int, Ge(0), Le(65535)] = Field(
+        9464, description="Prometheus metrics on this port of 127.0.0.1; 0: none."
+    )
 
 
 class PublishingConfig(BaseModel):
@@ -104,11 +144,16 @@ class Config(BaseModel):
     drift: DriftParameters = Field(DriftParameters(), description="When a camera counts as moved.")
     pairing: PairingConfig = Field(PairingConfig(), description="Which frames belong together.")
     publishing: PublishingConfig = Field(PublishingConfig(), description="Where the tracks go.")
+    cameras: CamerasSettings = Field(CamerasSettings(), description="The two cameras.")
+    recording: RecordingConfig = Field(RecordingConfig(), description="Where recordings go.")
+    daemon: DaemonConfig = Field(DaemonConfig(), description="How the daemon lives on its machine.")
 
     @cached_property
     def digest(self) -> str:
-        """Twelve hexadecimal digits (SHA-256) of every value but the rig's path, which has its own digest."""
-        content = json.dumps(self.model_dump(mode="json", exclude={"rig": {"path"}}), sort_keys=True)
+        """Twelve hexadecimal digits (SHA-256) of every value that can change a track, but for the rig's path."""
+        # The rig has a digest of its own; where a recording goes and how the process is scheduled change no track.
+        values = self.model_dump(mode="json", exclude={"rig": {"path"}, "recording": True, "daemon": True})
+        content = json.dumps(values, sort_keys=True)
         return hashlib.sha256(content.encode()).hexdigest()[:12]
 
 
@@ -188,12 +233,17 @@ def _merged(values: dict[str, Any], overrides: dict[str, Any]) -> dict[str, Any]
     return merged
 
 
+_PATHS = (("rig", "path"), ("recording", "folder"))
+
+
 def _anchored(values: dict[str, Any], folder: Path) -> dict[str, Any]:
-    """The same values with rig.path made absolute."""
-    rig = values.get("rig")
-    if not isinstance(rig, dict) or not isinstance(rig.get("path"), str) or not rig["path"]:
-        return values
-    return {**values, "rig": {**rig, "path": folder / Path(rig["path"]).expanduser()}}
+    """The same values with their paths made absolute."""
+    anchored = dict(values)
+    for table, key in _PATHS:
+        entries = values.get(table)
+        if isinstance(entries, dict) and isinstance(entries.get(key), str) and entries[key]:
+            anchored[table] = {**entries, key: folder / Path(entries[key]).expanduser()}
+    return anchored
 
 
 def _origin(entry: tuple[str | int, ...], variables: dict[str, tuple[str, ...]], path: Path | None) -> str:

@@ -18,7 +18,7 @@ from needletrack.config import Config, load_config
 from needletrack.errors import PublishError, RecordingError
 from needletrack.publish.message import TrackMessage
 from needletrack.publish.publisher import ZenohPublisher
-from needletrack.recording.asl import AslRecording
+from needletrack.recording.replay import StoredRecording
 from needletrack.recording.tracks import TrackFile
 from needletrack.records import NeedleTrack, Status, StereoPair
 from needletrack.replay import Published, Replay, open_recording
@@ -210,7 +210,7 @@ def _pictures(kept: _Kept, rig: Rig, config: Config, output: Path, name: str) ->
     return [*pictures, LeftFile(timeline.name, "tip, length, residual and latency over time")]
 
 
-def _played(recording: AslRecording, seconds: float) -> tuple[int, int]:
+def _played(recording: StoredRecording, seconds: float) -> tuple[int, int]:
     """How many pairs, and how often in turns forward and backward, last about so long."""
     stamps_ns: Sequence[int] = [pair.left.stamp_ns for pair in recording.pairs]
     end = max(1, bisect_right(stamps_ns, stamps_ns[0] + seconds * 1e9))

@@ -59,6 +59,13 @@ class Clock(StrEnum):
     RECORDED = "recorded"
 
 
+class StampPlace(StrEnum):
+    """Where in the exposure a capture stamp was taken, by what the driver says."""
+
+    START_OF_EXPOSURE = "start_of_exposure"
+    END_OF_FRAME = "end_of_frame"
+
+
 class Status(StrEnum):
     """What a controller may do with a track."""
 
@@ -121,6 +128,8 @@ class DropReason(StrEnum):
     MISSING_IMAGE = "missing_image"
     UNREADABLE_IMAGE = "unreadable_image"
     WRONG_SIZE = "wrong_size"
+    LOST_BY_DRIVER = "lost_by_driver"
+    BUFFER_ERROR = "buffer_error"
     OVERWRITTEN = "overwritten"
 
 
@@ -139,8 +148,9 @@ class Frame:
 class StereoPair:
     """Two frames of one instant; the pair's stamp is the left camera's.
 
+    exposure_ns: length of the exposure, None if unknown. stamp_at: where in it the stamps were taken, None if unknown.
     released_at_ns: when a paced replay let the pair go, on time.monotonic_ns's clock, from which its latency
-    counts; None for live and for unpaced pairs.
+    counts; None for live and for unpaced pairs. arrived_at_ns: when a live pair was complete, on the same clock.
     """
 
     left: Frame
@@ -149,6 +159,8 @@ class StereoPair:
     clock: Clock = Clock.RECORDED
     exposure_ns: int | None = None
     released_at_ns: int | None = None
+    stamp_at: StampPlace | None = None
+    arrived_at_ns: int | None = None
 
     @property
     def captured_at_ns(self) -> int:

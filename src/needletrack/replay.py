@@ -12,8 +12,9 @@ from typing import Literal
 from needletrack.config import Config
 from needletrack.publish.message import RunContext, Source, TrackMessage
 from needletrack.publish.publisher import ZenohPublisher
-from needletrack.recording.asl import AslRecording, UnusablePair
-from needletrack.recording.replay import ReplaySource
+from needletrack.recording.asl import UnusablePair
+from needletrack.recording.replay import ReplaySource, StoredRecording
+from needletrack.recording.stored import open_stored
 from needletrack.recording.tracks import TrackFile
 from needletrack.records import NeedleTrack, StereoPair
 from needletrack.rig import Rig, find_rig, import_camchain, read_rig
@@ -37,7 +38,7 @@ class Replay:
 
     def __init__(
         self,
-        recording: AslRecording,
+        recording: StoredRecording,
         config: Config,
         *,
         method: Method = "curve",
@@ -117,14 +118,14 @@ class Published:
         self._publisher.publish(message)
 
 
-def open_recording(folder: Path, config: Config, rig_path: Path | None = None) -> AslRecording:
+def open_recording(folder: Path, config: Config, rig_path: Path | None = None) -> StoredRecording:
     """A recording with its rig: rig_path's, else that of the configuration's rig.path, else its own.
 
     Raises RecordingError, CalibrationError.
     """
     chosen = rig_path or config.rig.path
     rig = None if chosen is None else rig_at(chosen)
-    return AslRecording(folder, rig, tolerance_us=config.pairing.tolerance_us)
+    return open_stored(folder, rig, tolerance_us=config.pairing.tolerance_us)
 
 
 def rig_at(path: Path) -> Rig:

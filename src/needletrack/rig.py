@@ -309,7 +309,15 @@ class Rig(StereoRig):
 def read_rig(path: Path | str) -> Rig:
     """The rig of a rig file (docs/configuration.md); CalibrationError names file, key and remedy."""
     path = Path(path)
-    document = _read_yaml(path)
+    return _rig_in(path, _read_yaml(path))
+
+
+def rig_from_text(text: str, path: Path) -> Rig:
+    """The rig of a rig file's content; path: where it came from, for what CalibrationError says."""
+    return _rig_in(path, _parsed_yaml(path, lambda: text))
+
+
+def _rig_in(path: Path, document: Any) -> Rig:
     if not isinstance(document, dict) or document.get("format") != "needletrack-rig":
         raise CalibrationError(
             f"{path}: not a rig file: its first entry must be `format: needletrack-rig` "
@@ -325,15 +333,13 @@ def write_rig(rig: Rig, path: Path | str) -> None:
     """
     path = Path(path).resolve()
     try:
-        document = _RigFile.of(rig).model_dump(mode="json")
-    except ValidationError as error:
-        found = "; ".join(complaint.message for complaint in complaints(error, _CameraEntry))
-        raise CalibrationError(f"{path}: a rig file cannot hold this rig: {found}") from error
-    text = yaml.safe_dump(document, sort_keys=False, default_flow_style=None, width=110, allow_unicode=True)
+        text = rig_text(rig)
+    except CalibrationError as error:
+        raise CalibrationError(f"{path}: {error}") from error
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     try:
         with temporary.open("w", encoding="utf-8") as file:
-            file.write(_HEADER + text)
+            file.write(text)
             file.flush()
             os.fsync(file.fileno())
         temporary.replace(path)
@@ -341,6 +347,16 @@ def write_rig(rig: Rig, path: Path | str) -> None:
         with suppress(OSError):
             temporary.unlink()
         raise CalibrationError(f"{path}: cannot write the rig file: {error.strerror or error}") from error
+
+
+def rig_text(rig: Rig) -> str:
+    """The content of a rig file; raises CalibrationError where one cannot hold the lens model."""
+    try:
+        document = _RigFile.of(rig).model_dump(mode="json")
+    except ValidationError as error:
+        found = "; ".join(complaint.message for complaint in complaints(error, _CameraEntry))
+        raise CalibrationError(f"a rig file cannot hold this rig: {found}") from error
+    return _HEADER + yaml.safe_dump(document, sort_keys=False, default_flow_style=None, width=110, allow_unicode=True)
 
 
 def import_camchain(path: Path | str, name: str | None = None) -> Rig:
@@ -543,8 +559,12 @@ def _refuse_other_models(path: Path, key: str, entry: object) -> None:
 
 
 def _read_yaml(path: Path) -> Any:
+    return _parsed_yaml(path, lambda: path.read_text(encoding="utf-8"))
+
+
+def _parsed_yaml(path: Path, text: Callable[[], str]) -> Any:
     try:
-        return yaml.safe_load(path.read_text(encoding="utf-8"))
+        return yaml.safe_load(text())
     except OSError as error:
         raise CalibrationError(f"{path}: cannot read the calibration: {error.strerror or error}") from error
     except (yaml.YAMLError, UnicodeDecodeError) as error:

@@ -8,7 +8,7 @@ every-frame replay has no slot: each pair is tracked before the next is read, so
 import threading
 import time
 from collections import Counter, deque
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import NamedTuple, Protocol
@@ -23,9 +23,12 @@ from needletrack.publish.message import (
     StatusMessage,
     TrackMessage,
     WireCalibration,
+    WireCamera,
     WireRates,
+    WireRecording,
+    WireSkew,
 )
-from needletrack.records import DropReason, NeedleTrack, Status, StereoPair
+from needletrack.records import Clock, DropReason, NeedleTrack, Status, StereoPair
 from needletrack.rig import Rig
 
 # A daemon runs for days: its memory must not grow with them.
@@ -71,11 +74,22 @@ class Arrival(NamedTuple):
     dropped: Mapping[DropReason, int]
 
 
+@dataclass(frozen=True)
+class Surroundings:
+    """What a heartbeat says of cameras and recorder, beside what the loop itself knows."""
+
+    cameras: Mapping[str, WireCamera] | None = None
+    skew: WireSkew | None = None
+    recording: WireRecording | None = None
+    last_error: str | None = None
+
+
 class Service:
     """Runs one source through one tracker into sinks.
 
     independent: every pair starts without memory. every_frame: no pair is skipped however slow tracking is; otherwise
-    the newest pair wins and the one it overwrites is counted. The counters may be read from any thread.
+    the newest pair wins and the one it overwrites is counted. surroundings is asked once a heartbeat; in_threads is
+    called in each of the two threads as it begins, with its name. The counters may be read from any thread.
     """
 
     def __init__(
@@ -89,16 +103,20 @@ class Service:
         independent: bool = False,
         heartbeat_s: float = 0.5,
         drift: DriftParameters | None = None,
+        surroundings: Callable[[], Surroundings] = Surroundings,
+        in_threads: Callable[[str], None] = lambda name: None,
     ) -> None:
         self._source, self._tracker, self._rig, self._run = source, tracker, rig, run
         self._every_frame, self._independent, self._heartbeat_s = every_frame, independent, heartbeat_s
         self._drift = drift or DriftParameters()
+        self._surroundings, self._in_threads = surroundings, in_threads
         self._slot = LatestSlot()
         self._state = ServiceState.STARTING
         self._started_s = time.monotonic()
         self._statuses: Counter[Status] = Counter()
         self._reasons: Counter[str] = Counter()
         self._last_sequence: int | None = None
+        self._busy_since_s: float | None = None
         self._reported = (self._started_s, 0, Counter[Status]())
 
     @property
@@ -109,6 +127,17 @@ class Service:
             dropped[DropReason.OVERWRITTEN] += self._slot.overwritten
         return dict(dropped)
 
+    @property
+    def statuses(self) -> dict[Status, int]:
+        """Tracks so far, by status."""
+        return dict(self._statuses)
+
+    @property
+    def busy_s(self) -> float:
+        """For how long the worker has been at the pair in hand; 0 where it waits for one."""
+        since_s = self._busy_since_s
+        return 0.0 if since_s is None else time.monotonic() - since_s
+
     def run(self, sinks: Sequence[Sink], stop: threading.Event) -> RunSummary:
         """Track until the source ends or `stop` is set; the first exception of any thread ends the run, raised here."""
         self._state = ServiceState.RUNNING
@@ -116,11 +145,14 @@ class Service:
         tracking_ms: deque[float] = deque(maxlen=_TIMES_KEPT)
         previous: NeedleTrack | None = None
         drift = DriftState()
+        self._in_threads("tracking")
         try:
             for pair, dropped in self._every_pair(stop) if self._every_frame else self._newest_pairs(stop):
-                began_s = time.perf_counter()
+                self._busy_since_s = time.monotonic()
+                began_ns = time.monotonic_ns()
                 track = self._tracker(pair, None if self._independent else previous)
-                tracking_ms.append((time.perf_counter() - began_s) * 1e3)
+                tracked_ms = (time.monotonic_ns() - began_ns) / 1e6
+                tracking_ms.append(tracked_ms)
                 # What is published may be doubted; the next pair is tracked from the track itself.
                 previous = track
                 drift = drift.after(track, self._rig, self._drift)
@@ -129,11 +161,19 @@ class Service:
                 self._statuses[track.status] += 1
                 self._reasons.update(track.reasons)
                 self._last_sequence = pair.sequence
-                published = in_published_frame(track, self._rig.registration)
-                message = TrackMessage.from_track(published, pair, self._run, dropped=dropped, published=Instant.now())
+                message = TrackMessage.from_track(
+                    in_published_frame(track, self._rig.registration),
+                    pair,
+                    self._run,
+                    dropped=dropped,
+                    published=Instant.now(),
+                    parts_ms={**_before_tracking_ms(pair, began_ns), "track": tracked_ms},
+                )
                 for sink in sinks:
                     sink.take(pair, track, message)
+                self._busy_since_s = None
         finally:
+            self._busy_since_s = None
             self._state = ServiceState.STOPPING
         duration_s = time.monotonic() - started_s
         return RunSummary(dict(self._statuses), dict(self._reasons), self.dropped, duration_s, tuple(tracking_ms))
@@ -151,6 +191,7 @@ class Service:
                 status.value: round((done[status] - done_before[status]) / elapsed_s, 2) for status in Status
             },
         )
+        around = self._surroundings()
         return StatusMessage.from_run(
             self._run,
             state=self._state,
@@ -162,6 +203,10 @@ class Service:
             rates=rates,
             dropped=self.dropped,
             counters={f"tracks_{status.value}": done[status] for status in Status},
+            last_error=around.last_error,
+            cameras=around.cameras,
+            skew=around.skew,
+            recording=around.recording,
         )
 
     def _every_pair(self, stop: threading.Event) -> Iterator[Arrival]:
@@ -184,6 +229,7 @@ class Service:
     def _capture(self, stop: threading.Event) -> None:
         failure: BaseException | None = None
         try:
+            self._in_threads("capture")
             for pair in self._source.pairs(stop):
                 self._slot.put(Arrival(pair, dict(self._source.dropped)))
         except BaseException as error:  # raised again by the worker
@@ -223,6 +269,21 @@ class LatestSlot:
         with self._changed:
             self._closed, self.failure = True, failure
             self._changed.notify()
+
+
+def _before_tracking_ms(pair: StereoPair, began_ns: int) -> dict[str, float]:
+    """The parts of the latency before tracking: from the stamp to the complete pair here, and its wait for the worker.
+
+    Only what this process's monotonic clock can tell: a camera's stamp on another clock gives no `capture`.
+    """
+    arrived_ns = pair.released_at_ns if pair.arrived_at_ns is None else pair.arrived_at_ns
+    if arrived_ns is None:
+        return {}
+    parts_ms = {"queue": (began_ns - arrived_ns) / 1e6}
+    if pair.arrived_at_ns is not None and pair.clock is not Clock.RECORDED:
+        behind_ns = 0 if pair.clock is Clock.MONOTONIC else time.time_ns() - time.monotonic_ns()
+        parts_ms["capture"] = (arrived_ns + behind_ns - pair.captured_at_ns) / 1e6
+    return parts_ms
 
 
 def _calibration(rig: Rig) -> WireCalibration:

@@ -16,6 +16,7 @@ from pydantic import TypeAdapter
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
+from needletrack.capture.pairing import SkewReport
 from needletrack.errors import RecordingError
 from needletrack.publish.message import TrackMessage
 from needletrack.records import DropReason, NeedleTrack, Status, StereoPair
@@ -121,6 +122,15 @@ def described(summary: RunSummary) -> str:
         p50, p99 = np.percentile(summary.tracking_ms, [50, 99])
         first += f"; tracking p50 {p50:.1f} ms, p99 {p99:.1f} ms"
     return "\n".join((first, f"  {statuses_text(summary)}", f"  dropped: {counted(summary.dropped) or 'none'}"))
+
+
+def described_skew(skew: SkewReport) -> str:
+    """`  cameras: hardware_triggered; right is 12 ± 9 us after left`, as the stamps say it."""
+    if skew.offset_us is None:
+        return "  cameras: too few frames to tell how they are triggered"
+    spread = "" if skew.spread_us is None else f" ± {skew.spread_us:.0f}"
+    drift = "" if skew.drift_ppm is None else f", drifting by {skew.drift_ppm:.1f} ± {skew.drift_sigma_ppm:.1f} us/s"
+    return f"  cameras: look {skew.looks.value}; right is {skew.offset_us:.0f}{spread} us after left{drift}"
 
 
 def statuses_text(summary: RunSummary) -> str:

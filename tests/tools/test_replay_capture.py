@@ -16,6 +16,7 @@ from tests.recording.small_recording import small_rig, write_recording
 from tools.replay_capture import app
 from typer.testing import CliRunner, Result
 
+from needletrack.cli import app as needletrack_app
 from needletrack.client import Subscriber
 from needletrack.publish.message import TrackMessage
 from needletrack.recording.asl import AslRecording
@@ -242,3 +243,34 @@ def test_one_thread_for_numpy_and_opencv() -> None:
     counts, _, opencv = done.stdout.strip().rpartition(" ")
     assert set(json.loads(counts)) == {1}
     assert opencv == "1"
+
+
+def test_every_kind_of_recording_gives_the_same_bytes(tmp_path: Path) -> None:
+    """A folder of ours, the same as MCAP, as a ROS 2 bag, and as a folder again, by the commands that make them."""
+    asl = write_recording(tmp_path / "asl", [1_000_000_000 + number * 10 * MS for number in range(4)])
+    rig = tmp_path / "asl" / "rig.yaml"
+
+    def command(*arguments: object) -> None:
+        result = CliRunner().invoke(needletrack_app, [str(argument) for argument in arguments])
+        assert result.exit_code == 0, result.stderr
+        assert "4 pairs" in result.stdout
+
+    command("import", asl, tmp_path / "ours.mcap", "--rig", rig)
+    command("export", tmp_path / "ours.mcap", tmp_path / "bag", "--to", "ros2")
+    command("import", tmp_path / "bag", tmp_path / "again.mcap", "--rig", rig)
+    command("export", tmp_path / "again.mcap", tmp_path / "folder")
+    cut = tmp_path / "cut.mcap"
+    cut.write_bytes((tmp_path / "ours.mcap").read_bytes()[:-10])
+    command("recover", cut, tmp_path / "recovered.mcap")
+    written = []
+    for number, name in enumerate(("asl", "ours.mcap", "bag", "again.mcap", "folder", "recovered.mcap")):
+        output = tmp_path / f"{number}.jsonl"
+        options = ["--rig", rig] if name == "bag" else []
+        result = replay(tmp_path / name, *options, "--output", output)
+        assert result.exit_code == 0, result.stderr
+        written.append(output.read_bytes())
+    assert len(written[0].splitlines()) == 4
+    assert set(written) == {written[0]}
+    told = replay(cut)
+    assert told.exit_code == 2
+    assert "needletrack recover" in told.stderr

@@ -24,6 +24,7 @@ from needletrack.records import (
     NeedleTrack,
     Quality,
     Reason,
+    StampPlace,
     Status,
     StereoPair,
     TipPose,
@@ -202,6 +203,9 @@ class TrackMessage(WirePart):
     clock: Clock = Field(description="recorded: whatever the recording's clock was")
     captured_at_unix_ns: int | None = Field(description="the same instant in Unix time; null if unknown")
     exposure_ns: Count | None = Field(description="length of the exposure; null if unknown")
+    stamp_at: StampPlace | None = Field(
+        description="where in the exposure the stamp was taken, by the driver; null if unknown"
+    )
     published_at_ns: int | None = Field(
         description="Unix time (CLOCK_REALTIME of the daemon's host); null in a deterministic replay"
     )
@@ -221,7 +225,10 @@ class TrackMessage(WirePart):
     tip: WireTip | None = Field(description="the free end; never null when ok")
     base: WireBase | None = Field(description="where the needle leaves its sleeve or the image; null if unknown")
     quality: WireQuality = Field(description="how well the shape explains the images")
-    timing_ms: Mapping[str, float] | None = Field(description="stage: milliseconds; null in a deterministic replay")
+    timing_ms: Mapping[str, float] | None = Field(
+        description="part of the latency, or stage of tracking: milliseconds (docs/latency.md); null in a "
+        "deterministic replay"
+    )
     latency_ms: float | None = Field(
         description="exposure (live) or release (replay) to publish; null if unknown or deterministic"
     )
@@ -238,8 +245,9 @@ class TrackMessage(WirePart):
         *,
         dropped: Mapping[DropReason, int],
         published: Instant | None,
+        parts_ms: Mapping[str, float] | None = None,
     ) -> Self:
-        """The message for a track of a pair, published now.
+        """The message for a track of a pair, published now; parts_ms: of the latency, beside the stages of tracking.
 
         dropped: the counts at the moment at which the pair was taken up, so that a gap in the sequence
         and its count stand in the same message. published: without effect in a deterministic run, which
@@ -263,6 +271,7 @@ class TrackMessage(WirePart):
             clock=pair.clock,
             captured_at_unix_ns=_captured_at_unix_ns(pair, published),
             exposure_ns=pair.exposure_ns,
+            stamp_at=pair.stamp_at,
             published_at_ns=None if published is None else published.unix_ns,
             status=track.status,
             reasons=tuple(reason.value for reason in track.reasons),
@@ -276,7 +285,7 @@ class TrackMessage(WirePart):
             quality=WireQuality.from_quality(track.quality, pair),
             timing_ms=None
             if run.deterministic
-            else {stage: round(ms, MS_DIGITS) for stage, ms in track.timing_ms.items()},
+            else {stage: round(ms, MS_DIGITS) for stage, ms in {**(parts_ms or {}), **track.timing_ms}.items()},
             latency_ms=_rounded_or_none(_latency_ms(pair, published), MS_DIGITS),
             dropped=_counted(dropped),
         )
@@ -324,6 +333,42 @@ class WireRates(WirePart):
     tracks_per_s: Mapping[str, NotNegative] = Field(description="status: tracks published")
 
 
+class WireCamera(WirePart):
+    """One camera; its counts are those since the daemon's start."""
+
+    state: str = Field(description="absent, starting, streaming or stalled; the list may grow within version 1")
+    node: str = Field(description="where it is now, e.g. /dev/video0")
+    frames: Count = Field(description="frames that came, those with an error included")
+    lost_by_driver: Count = Field(description="frames that the driver counted and did not deliver")
+    buffer_errors: Count = Field(description="frames that were flagged as errors, short or undecodable")
+    queue_errors: Count = Field(description="refusals of the driver to take a buffer back")
+    stalls: Count = Field(description="times that nothing came for too long")
+    restarts: Count = Field(description="times that it was started anew")
+    rate_hz: NotNegative | None = Field(description="of the last frames, by their stamps; null if unknown")
+    exposure_us: NotNegative | None = Field(description="null if unknown, or automatic")
+    stamp_at: StampPlace | None = Field(description="as in the track message")
+
+
+class WireSkew(WirePart):
+    """Right stamps minus the nearest left ones over the last minute, paired or not; null where too little was seen."""
+
+    offset_us: float | None = Field(description="the median")
+    spread_us: NotNegative | None = Field(description="half the width that holds nine of ten, without the drift")
+    drift_ppm: float | None = Field(description="how much faster the right stamps run, microseconds a second")
+    drift_sigma_ppm: NotNegative | None = Field(description="standard deviation of the drift")
+    looks: str = Field(description="hardware_triggered, free_running or unknown")
+
+
+class WireRecording(WirePart):
+    """The recording that runs beside tracking."""
+
+    file: str = Field(description="being written now")
+    pairs: Count = Field(description="recorded since the start")
+    dropped: Count = Field(description="tracked or not, but not recorded: the disk was too slow, full or gone")
+    megabytes: NotNegative = Field(description="written since the start")
+    error: str | None = Field(description="why it pauses; null while it runs")
+
+
 class StatusMessage(WirePart):
     """The daemon's heartbeat, on key `<prefix>/<rig>/status`, which answers queries with the newest one."""
 
@@ -346,6 +391,9 @@ class StatusMessage(WirePart):
     dropped: Mapping[str, Count] = Field(description="as in the track message")
     counters: Mapping[str, Count] = Field(description="whatever else the daemon counts since its start")
     last_error: str | None = Field(description="the newest error that the daemon survived; null if none")
+    cameras: Mapping[str, WireCamera] | None = Field(description="left and right; null in a replay")
+    skew: WireSkew | None = Field(description="what both cameras' stamps say of each other; null in a replay")
+    recording: WireRecording | None = Field(description="null where nothing is recorded")
 
     @classmethod
     def from_run(
@@ -362,6 +410,9 @@ class StatusMessage(WirePart):
         dropped: Mapping[DropReason, int] | None = None,
         counters: Mapping[str, int] | None = None,
         last_error: str | None = None,
+        cameras: Mapping[str, WireCamera] | None = None,
+        skew: WireSkew | None = None,
+        recording: WireRecording | None = None,
     ) -> Self:
         """The heartbeat of a run; what is left out is null, zero or empty."""
         return cls(
@@ -382,6 +433,9 @@ class StatusMessage(WirePart):
             dropped=_counted(dropped or {}),
             counters=dict(sorted((counters or {}).items())),
             last_error=last_error,
+            cameras=cameras,
+            skew=skew,
+            recording=recording,
         )
 
     @classmethod

@@ -13,6 +13,8 @@ from typing import Any
 
 import numpy as np
 
+from needletrack.capture.live import CameraState
+from needletrack.capture.pairing import Trigger
 from needletrack.errors import PublishError
 from needletrack.geometry.transform import orientation_along
 from needletrack.publish.message import (
@@ -24,9 +26,12 @@ from needletrack.publish.message import (
     TrackMessage,
     WireBase,
     WireCalibration,
+    WireCamera,
     WirePart,
     WireQuality,
     WireRates,
+    WireRecording,
+    WireSkew,
     WireTip,
 )
 from needletrack.records import (
@@ -38,6 +43,7 @@ from needletrack.records import (
     NeedleCurve,
     NeedleTrack,
     Quality,
+    StampPlace,
     Status,
     StereoPair,
     TipPose,
@@ -51,6 +57,9 @@ TABLES: dict[str, type[WirePart]] = {
     "status fields": StatusMessage,
     "calibration fields": WireCalibration,
     "rates fields": WireRates,
+    "camera fields": WireCamera,
+    "skew fields": WireSkew,
+    "recording fields": WireRecording,
 }
 _GENERATED = re.compile(r"(?<=<!-- generated: )([a-z ]+)( -->\n).*?(?=<!-- end -->)", re.DOTALL)
 
@@ -72,6 +81,7 @@ def example_track(points: int = 5) -> tuple[NeedleTrack, StereoPair]:
         sequence=1207,
         clock=Clock.REALTIME,
         exposure_ns=4_000_000,
+        stamp_at=StampPlace.START_OF_EXPOSURE,
     )
     track = NeedleTrack(
         captured_at_ns=pair.captured_at_ns,
@@ -128,8 +138,29 @@ def example_messages() -> tuple[TrackMessage, StatusMessage]:
         rates=WireRates(pairs_per_s=60.0, tracks_per_s={"ok": 59.4, "degraded": 0.4, "invalid": 0.2}),
         dropped=dropped,
         counters={"pairs": 1208},
+        cameras={side: _example_camera(number) for number, side in enumerate(("left", "right"))},
+        skew=WireSkew(offset_us=12.0, spread_us=9.0, drift_ppm=0.1, drift_sigma_ppm=0.2, looks=Trigger.HARDWARE.value),
+        recording=WireRecording(
+            file="/data/lab-20260528T202640-0.mcap", pairs=1208, dropped=0, megabytes=1913.4, error=None
+        ),
     )
     return message, status
+
+
+def _example_camera(number: int) -> WireCamera:
+    return WireCamera(
+        state=CameraState.STREAMING.value,
+        node=f"/dev/video{2 * number}",
+        frames=1211,
+        lost_by_driver=0,
+        buffer_errors=0,
+        queue_errors=0,
+        stalls=0,
+        restarts=0,
+        rate_hz=60.0,
+        exposure_us=4000.0,
+        stamp_at=StampPlace.START_OF_EXPOSURE,
+    )
 
 
 def documents(page: str) -> Iterator[tuple[str, str]]:

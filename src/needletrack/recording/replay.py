@@ -2,16 +2,51 @@
 
 import logging
 import time
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from pathlib import Path
 from threading import Event
+from typing import Protocol
 
 from needletrack.errors import RecordingError
-from needletrack.recording.asl import AslRecording, Loss, UnusablePair
+from needletrack.recording.asl import ListedPair, Loss, UnusablePair
 from needletrack.records import DropReason, StereoPair
+from needletrack.rig import Rig
 
 _log = logging.getLogger(__name__)
+
+
+class StoredRecording(Protocol):
+    """What every kind of recording offers: its pairs in the order of their stamps, read one at a time."""
+
+    @property
+    def folder(self) -> Path:
+        """Where it lies: a folder or a file."""
+        ...
+
+    @property
+    def rig(self) -> Rig:
+        """The rig that it was taken with, or that was named in its place."""
+        ...
+
+    @property
+    def pairs(self) -> Sequence[ListedPair]:
+        """Its pairs, images unread."""
+        ...
+
+    @property
+    def losses(self) -> Sequence[Loss]:
+        """Its frames that are in no pair."""
+        ...
+
+    def __len__(self) -> int:
+        """Number of its pairs."""
+        ...
+
+    def read(self, index: int) -> StereoPair:
+        """The pair at an index, which is its sequence number; raises UnusablePair. Called by one thread at a time."""
+        ...
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,7 +74,7 @@ class ReplaySource:
 
     def __init__(
         self,
-        recording: AslRecording,
+        recording: StoredRecording,
         *,
         paced: bool = False,
         start: int = 0,

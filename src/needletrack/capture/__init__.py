@@ -1,0 +1,1 @@
+"""Live stereo pairs: the cameras, and which of their frames belong together."""

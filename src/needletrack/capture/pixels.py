@@ -1,0 +1,63 @@
+"""Driver buffers to 8-bit gray images."""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from needletrack.records import Image
+
+_END_OF_JPEG = b"\xff\xd9"
+# Where the first luminance byte lies in two, for the packed formats.
+_LUMINANCE = {"YUYV": 0, "UYVY": 1}
+_BITS = {"Y10": 10, "Y12": 12}
+
+
+@dataclass(frozen=True, slots=True)
+class Layout:
+    """How a driver lays out a picture: a format of `PixelFormat`, pixels, bytes a row; bits: of Y16, those in use."""
+
+    format: str
+    width: int
+    height: int
+    stride: int
+    bits: int = 16
+
+
+def decoded(data: bytes | memoryview, layout: Layout) -> Image:
+    """The picture in a buffer as a new read-only array (rows, columns); nothing of the buffer is kept.
+
+    Of more than eight bits the upper eight in use are kept. Raises ValueError where the buffer is too short, or
+    no whole JPEG of the size.
+    """
+    image = _jpeg(data, layout) if layout.format == "MJPG" else _packed(data, layout)
+    image.flags.writeable = False
+    return image
+
+
+def _packed(data: bytes | memoryview, layout: Layout) -> Image:
+    wanted = layout.stride * layout.height
+    if len(data) < wanted:
+        raise ValueError(f"{len(data)} bytes in place of {wanted}")
+    rows = np.frombuffer(data, np.uint8, wanted).reshape(layout.height, layout.stride)
+    if layout.format == "GREY":
+        return rows[:, : layout.width].copy()
+    row_bytes = rows[:, : 2 * layout.width]
+    if layout.format in _LUMINANCE:
+        return np.ascontiguousarray(row_bytes[:, _LUMINANCE[layout.format] :: 2])
+    shift = _BITS.get(layout.format, layout.bits) - 8
+    words = np.ascontiguousarray(row_bytes).view("<u2") >> shift
+    gray: Image = np.minimum(words, 255).astype(np.uint8)
+    return gray
+
+
+def _jpeg(data: bytes | memoryview, layout: Layout) -> Image:
+    # libjpeg fills what is missing with gray and says nothing.
+    if _END_OF_JPEG not in bytes(data[-64:]):
+        raise ValueError("the JPEG has no end")
+    picture = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE)
+    if picture is None:
+        raise ValueError("no JPEG")
+    if picture.shape != (layout.height, layout.width):
+        raise ValueError(f"a JPEG of {picture.shape[1]}x{picture.shape[0]}")
+    return np.asarray(picture, np.uint8)

@@ -1,0 +1,1 @@
+"""What stands beside the rig: the daemon, and recording without tracking."""

@@ -1,0 +1,266 @@
+"""`needletrack run`: cameras to tracks on the wire, for as long as the day lasts."""
+
+import logging
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack
+from dataclasses import asdict, dataclass
+from enum import IntEnum
+
+import numpy as np
+
+from needletrack.capture.kernel import Kernel
+from needletrack.capture.live import LiveSource
+from needletrack.capture.pairing import SkewReport
+from needletrack.capture.source import FrameSource
+from needletrack.config import Config
+from needletrack.daemon.metrics import Metrics
+from needletrack.daemon.process import AlreadyRunning, OnlyInstance, lock_memory, schedule_thread, settle_memory
+from needletrack.daemon.systemd import Notifier
+from needletrack.errors import CaptureError, ConfigError
+from needletrack.publish.message import RunContext, Source, TrackMessage, WireCamera, WireRecording, WireSkew
+from needletrack.publish.publisher import ZenohPublisher
+from needletrack.recording.mcap_file import About
+from needletrack.recording.recorder import Recorder, RecorderSettings
+from needletrack.records import DropReason, Frame, NeedleTrack, StereoPair
+from needletrack.rig import Rig
+from needletrack.service import RunSummary, Service, Sink, Surroundings, Tracker
+from needletrack.tracking.track import track_pair
+
+_log = logging.getLogger(__name__)
+
+# One that takes longer for a pair, or whose capture does not turn, is stuck: systemd may start it anew.
+_STUCK_AFTER_S = 5.0
+# A stop is done within a second: the pair in hand, the publisher, and this.
+_RECORDER_ENDS_WITHIN_S = 0.4
+_STATUS_EVERY_S = 1.0
+
+
+class ExitCode(IntEnum):
+    """How `needletrack run` ended."""
+
+    STOPPED = 0
+    FAILED = 1
+    UNUSABLE = 2
+    CAMERAS = 3
+    ALREADY_RUNNING = 4
+
+
+class RecordedSource:
+    """A source whose every pair is offered to a recorder before it goes on."""
+
+    def __init__(self, source: FrameSource, recorder: Recorder) -> None:
+        self._source, self._recorder = source, recorder
+
+    @property
+    def dropped(self) -> Mapping[DropReason, int]:
+        """Frames lost so far by reason; what was not recorded is not lost to tracking, and not here."""
+        return self._source.dropped
+
+    def pairs(self, stop: threading.Event) -> Iterator[StereoPair]:
+        """The source's pairs."""
+        for pair in self._source.pairs(stop):
+            self._recorder.offer(pair)
+            yield pair
+
+
+@dataclass(frozen=True)
+class DaemonSummary:
+    """What a run of the daemon did: the loop's summary, what the stamps say, and the recorder's counts."""
+
+    run: RunSummary
+    skew: SkewReport
+    recorded: int | None
+    unrecorded: int | None
+
+
+class Daemon:
+    """Cameras, tracker, publisher, recorder and metrics of one rig, as configured.
+
+    kernel: where the cameras are (None: this machine's). Raises ConfigError where rig and cameras contradict each
+    other, CalibrationError where the rig sees nothing of the workspace.
+    """
+
+    def __init__(self, rig: Rig, config: Config, *, kernel: Kernel | None = None) -> None:
+        require_fit(rig, config)
+        self.rig, self.config = rig, config
+        self.context = RunContext(rig.name, Source.LIVE, config.digest, rig.digest)
+        self._cameras = LiveSource(
+            config.cameras,
+            tolerance_us=config.pairing.tolerance_us,
+            offset_us=config.pairing.offset_us,
+            kernel=kernel,
+        )
+        self._recorder: Recorder | None = None
+        self.service: Service | None = None
+
+    def run(self, stop: threading.Event, *, ready: Callable[[], None] = lambda: None) -> DaemonSummary:
+        """Run until `stop` is set; ready is called once everything but the cameras is there.
+
+        Raises AlreadyRunning, CaptureError, PublishError, RecordingError, and whatever a thread raised.
+        """
+        config, rig = self.config, self.rig
+        with ExitStack() as opened:
+            opened.enter_context(OnlyInstance(rig.name))
+            notifier = Notifier()
+            opened.callback(notifier.close)
+            source: FrameSource = self._cameras
+            if config.recording.folder is not None:
+                self._recorder = Recorder(_recorder_settings(config), self._about(), config.cameras.size_px)
+                opened.callback(self._recorder.close, _RECORDER_ENDS_WITHIN_S)
+                source = RecordedSource(source, self._recorder)
+            tracker = tracker_of(rig, config)
+            service = self.service = Service(
+                source,
+                tracker,
+                rig,
+                self.context,
+                heartbeat_s=config.publishing.heartbeat_s,
+                surroundings=self.surroundings,
+                in_threads=self._in_thread,
+            )
+            publisher = opened.enter_context(self._publisher(service))
+            metrics = opened.enter_context(Metrics(service, self.surroundings, config.daemon.metrics_port))
+            if config.daemon.lock_memory:
+                lock_memory()
+            warm_up(tracker, rig)
+            settle_memory()
+            opened.enter_context(_Pulse(notifier, service, self._cameras))
+            notifier.ready("waiting for both cameras")
+            ready()
+            _log.info("the daemon runs", extra={"rig_digest": rig.digest, "config_digest": config.digest})
+            sinks: list[Sink] = [_Published(publisher), metrics]
+            if self._recorder is not None:
+                sinks.append(self._recorder)
+            run = service.run(sinks, stop)
+            notifier.stopping()
+        recorder = self._recorder
+        return DaemonSummary(
+            run,
+            self._cameras.skew,
+            None if recorder is None else recorder.recorded,
+            None if recorder is None else recorder.dropped,
+        )
+
+    def surroundings(self) -> Surroundings:
+        """Cameras, skew and recorder as a heartbeat tells them."""
+        cameras: dict[str, WireCamera] = {
+            side: WireCamera.model_validate(asdict(health)) for side, health in self._cameras.health.items()
+        }
+        recording, recorder = None, self._recorder
+        last_error = self._cameras.last_error
+        if recorder is not None:
+            state = recorder.state
+            recording = WireRecording(
+                file=state.file,
+                pairs=recorder.recorded,
+                dropped=recorder.dropped,
+                megabytes=state.megabytes,
+                error=state.error,
+            )
+            last_error = state.error or last_error
+        skew = WireSkew.model_validate(asdict(self._cameras.skew))
+        return Surroundings(cameras, skew, recording, last_error)
+
+    def _publisher(self, service: Service) -> ZenohPublisher:
+        settings = self.config.publishing
+        return ZenohPublisher(
+            self.context,
+            service.status,
+            listen=settings.listen,
+            connect=settings.connect,
+            key_prefix=settings.key_prefix,
+            heartbeat_s=settings.heartbeat_s,
+        )
+
+    def _about(self) -> About:
+        return About(self.rig, self.rig.name, self.context.run_id, self.config.model_dump_json())
+
+    def _in_thread(self, name: str) -> None:
+        settings = self.config.daemon
+        # Capture before tracking: a late pair can be tracked, a lost buffer cannot.
+        priority = settings.realtime_priority - (name == "tracking" and settings.realtime_priority > 1)
+        schedule_thread(name, priority, settings.cpus)
+
+
+class _Published:
+    def __init__(self, publisher: ZenohPublisher) -> None:
+        self._publisher = publisher
+
+    def take(self, pair: StereoPair, track: NeedleTrack, message: TrackMessage) -> None:
+        self._publisher.publish(message)
+
+
+class _Pulse:
+    """Tells systemd twice in its interval that neither thread is stuck, as long as that is so."""
+
+    def __init__(self, notifier: Notifier, service: Service, cameras: LiveSource) -> None:
+        self._notifier, self._service, self._cameras = notifier, service, cameras
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._beat, name="needletrack-pulse", daemon=True)
+
+    def __enter__(self) -> None:
+        self._thread.start()
+
+    def __exit__(self, *unused: object) -> None:
+        self._stop.set()
+        self._thread.join()
+
+    def _beat(self) -> None:
+        every_s = min(self._notifier.watchdog_s / 2 or _STATUS_EVERY_S, _STATUS_EVERY_S)
+        told = False
+        while not self._stop.wait(every_s):
+            silent_s = time.monotonic() - self._cameras.alive_at_s
+            if max(silent_s, self._service.busy_s) < _STUCK_AFTER_S:
+                states = ", ".join(f"{side} {health.state.value}" for side, health in self._cameras.health.items())
+                self._notifier.alive(f"cameras: {states}; {sum(self._service.statuses.values())} pairs tracked")
+                told = False
+            elif not told:
+                _log.error("stuck: capture for %.1f s, tracking for %.1f s", silent_s, self._service.busy_s)
+                told = True
+
+
+def tracker_of(rig: Rig, config: Config) -> Tracker:
+    """Our method with a rig and its parameters."""
+
+    def tracked(pair: StereoPair, previous: NeedleTrack | None) -> NeedleTrack:
+        return track_pair(pair, rig, config.tracking, previous)
+
+    return tracked
+
+
+def warm_up(tracker: Tracker, rig: Rig) -> None:
+    """Track an empty pair, for nothing: the first call of every library takes a multiple of the next."""
+    width, height = rig.left.size_px
+    empty = Frame(np.zeros((height, width), np.uint8), 0)
+    tracker(StereoPair(empty, empty, 0), None)
+
+
+def require_fit(rig: Rig, config: Config) -> None:
+    """Raise where the cameras' images are not the rig's, or the rig sees nothing of the workspace."""
+    rig.require_view_of(config.tracking.workspace)
+    if rig.left.size_px != config.cameras.size_px:
+        wanted, set_to = ("x".join(map(str, size)) for size in (rig.left.size_px, config.cameras.size_px))
+        raise ConfigError(
+            f"cameras.size_px is {set_to}, but rig {rig.name} was calibrated at {wanted}: a calibration holds for its "
+            "own size alone"
+        )
+
+
+def exit_code(error: Exception) -> ExitCode:
+    """The code for an error that is raised on purpose."""
+    if isinstance(error, AlreadyRunning):
+        return ExitCode.ALREADY_RUNNING
+    return ExitCode.CAMERAS if isinstance(error, CaptureError) else ExitCode.UNUSABLE
+
+
+def _recorder_settings(config: Config) -> RecorderSettings:
+    settings = config.recording
+    assert settings.folder is not None
+    return RecorderSettings(
+        settings.folder,
+        buffer_mb=settings.buffer_mb,
+        min_free_mb=settings.min_free_mb,
+        max_file_mb=settings.max_file_mb,
+    )

@@ -1,0 +1,317 @@
+"""ROS bags with two image topics: read as a recording, made one of ours, and written from one."""
+
+import weakref
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from rosbags.highlevel import AnyReader, AnyReaderError
+from rosbags.interfaces import Connection
+from rosbags.rosbag2 import StoragePlugin
+from rosbags.rosbag2 import Writer as BagWriter
+
+from needletrack.errors import CalibrationError, RecordingError
+from needletrack.recording.asl import ListedFrame, ListedPair, Loss, UnusablePair
+from needletrack.recording.mcap_file import (
+    LEFT_TOPIC,
+    RIGHT_TOPIC,
+    About,
+    PairWriter,
+    image_cdr,
+    typestore,
+)
+from needletrack.recording.pairing import in_order, pair_by_stamp
+from needletrack.recording.replay import StoredRecording
+from needletrack.records import Clock, DropReason, Frame, Image, StereoPair
+from needletrack.rig import Rig
+
+_IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
+_CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
+_WORDS = (("left", "right"), ("cam0", "cam1"), ("camera0", "camera1"), ("infra1", "infra2"))
+_BITS_16 = {"mono16", "16UC1"}
+_TO_GRAY = {
+    "rgb8": cv2.COLOR_RGB2GRAY,
+    "bgr8": cv2.COLOR_BGR2GRAY,
+    "rgba8": cv2.COLOR_RGBA2GRAY,
+    "bgra8": cv2.COLOR_BGRA2GRAY,
+}
+_GRAY = {"mono8", "8UC1"}
+
+
+@dataclass(frozen=True, slots=True)
+class _Stored:
+    """An image of the bag: its header's stamp, and when it was recorded, by which it is found."""
+
+    stamp_ns: int
+    recorded_ns: int
+
+
+class BagRecording:
+    """The pairs of a ROS 1 or ROS 2 bag with two topics of images (raw or compressed), by their headers' stamps.
+
+    topics: left and right; None where the names tell them apart. The whole bag is read once for its stamps. Raises
+    RecordingError where it is no bag, or its topics are not two; CalibrationError without a rig.
+    """
+
+    def __init__(
+        self,
+        path: Path | str,
+        rig: Rig | None = None,
+        *,
+        tolerance_us: float = 1000.0,
+        topics: tuple[str, str] | None = None,
+    ) -> None:
+        self.folder = Path(path)
+        if rig is None:
+            raise CalibrationError(f"{self.folder}: a bag holds no rig: name one with --rig")
+        self.rig = rig
+        self._reader = _opened(self.folder)
+        self._close_reader = weakref.finalize(self, self._reader.close)
+        self._topics = _two_topics(self.folder, self._reader, topics)
+        stored = [self._stamps(connection) for connection in self._topics]
+        ordered = [[frames[i] for i in in_order([frame.stamp_ns for frame in frames])] for frames in stored]
+        left, right = ([frame.stamp_ns for frame in frames] for frames in ordered)
+        near = pair_by_stamp(left, right, round(tolerance_us * 1000))
+        if not near:
+            raise RecordingError(
+                f"{self.folder}: no image of {self._topics[0].topic} has one of {self._topics[1].topic} within "
+                f"{tolerance_us:g} us: see pairing.tolerance_us"
+            )
+        self._stored = [(ordered[0][i], ordered[1][j]) for i, j in near]
+        self.pairs: Sequence[ListedPair] = tuple(
+            ListedPair(ListedFrame(self.folder, l.stamp_ns), ListedFrame(self.folder, r.stamp_ns))
+            for l, r in self._stored
+        )
+        self.losses: Sequence[Loss] = [
+            Loss(reason, self.folder, "it is in no pair", len(self.pairs))
+            for reason, frames in zip((DropReason.UNPAIRED_LEFT, DropReason.UNPAIRED_RIGHT), stored, strict=True)
+            for _ in range(len(frames) - len(near))
+        ]
+
+    def __len__(self) -> int:
+        return len(self.pairs)
+
+    def read(self, index: int) -> StereoPair:
+        """The pair at an index, which is its sequence number; raises UnusablePair."""
+        images: list[Image] = []
+        losses: list[Loss] = []
+        size_px = self.rig.left.size_px
+        sides = zip(
+            self._topics, self._stored[index], (DropReason.UNPAIRED_LEFT, DropReason.UNPAIRED_RIGHT), strict=True
+        )
+        for connection, stored, unpaired in sides:
+            try:
+                image = _gray(self._message(connection, stored))
+            except ValueError as error:
+                losses.append(Loss(DropReason.UNREADABLE_IMAGE, self.folder, f"pair {index}: {error}", index))
+                continue
+            if image.shape != size_px[::-1]:
+                fault = f"pair {index}: the image is {image.shape[1]}x{image.shape[0]}, the rig says {size_px}"
+                losses.append(Loss(DropReason.WRONG_SIZE, self.folder, fault, index))
+                continue
+            losses.append(Loss(unpaired, self.folder, "its partner is lost", index))
+            images.append(image)
+        if len(images) < 2:
+            raise UnusablePair(tuple(losses))
+        left, right = self._stored[index]
+        frames = Frame(images[0], left.stamp_ns), Frame(images[1], right.stamp_ns)
+        return StereoPair(*frames, sequence=index, clock=Clock.RECORDED)
+
+    def close(self) -> None:
+        """Close the bag; done by itself when nobody has the recording any more."""
+        self._close_reader()
+
+    def _stamps(self, connection: Connection) -> list[_Stored]:
+        found = []
+        for _, recorded_ns, raw in self._reader.messages([connection]):
+            stamp = self._deserialized(connection, raw).header.stamp
+            found.append(_Stored(stamp.sec * 1_000_000_000 + stamp.nanosec, recorded_ns))
+        return found
+
+    def _message(self, connection: Connection, stored: _Stored) -> Any:
+        at = stored.recorded_ns
+        for _, _, raw in self._reader.messages([connection], start=at, stop=at + 1):
+            message = self._deserialized(connection, raw)
+            if message.header.stamp.sec * 1_000_000_000 + message.header.stamp.nanosec == stored.stamp_ns:
+                return message
+        raise ValueError("the image is not there any more")
+
+    def _deserialized(self, connection: Connection, raw: bytes) -> Any:
+        return self._reader.deserialize(raw, connection.msgtype)
+
+
+def is_bag(path: Path) -> bool:
+    """Whether a path looks like a ROS bag: a ROS 1 file, a ROS 2 folder or file."""
+    return path.suffix in (".bag", ".db3", ".mcap") or (path / "metadata.yaml").is_file()
+
+
+@dataclass(frozen=True, slots=True)
+class Copied:
+    """What was written: where, pairs, and a sentence for each pair that could not be read."""
+
+    path: Path
+    pairs: int
+    left_out: tuple[str, ...]
+
+
+def write_recording(
+    recording: StoredRecording, output: Path, rig: Rig | None, progress: Callable[[int], None] = lambda done: None
+) -> Copied:
+    """Any recording as one of ours, stamps unchanged; raises RecordingError where it cannot be written."""
+    name = (rig or recording.rig).name
+    about = About(rig=rig, name=name, clock=Clock.RECORDED)
+    writer = PairWriter(output, about)
+    left_out = []
+    try:
+        for index in range(len(recording)):
+            try:
+                pair = recording.read(index)
+            except UnusablePair as error:
+                left_out.append(str(error))
+                continue
+            stamps = pair.left.captured_at_ns, pair.right.captured_at_ns
+            writer.add_pair(index, pair.left.image, stamps[0], pair.right.image, stamps[1])
+            progress(index + 1)
+        writer.finish()
+    except OSError as error:
+        writer.abandon()
+        raise RecordingError(f"{output}: cannot be written: {error.strerror or error}") from error
+    return Copied(output, writer.pairs, tuple(left_out))
+
+
+def write_bag(
+    recording: StoredRecording, output: Path, *, with_rig: bool = True, tracks: Sequence[tuple[int, bytes]] = ()
+) -> Copied:
+    """A ROS 2 bag (a folder, MCAP inside) with /left and /right image_raw and camera_info, and the tracks as strings.
+
+    tracks: (stamp ns, message) each. Raises RecordingError where it exists or cannot be written.
+    """
+    if output.exists():
+        raise RecordingError(f"{output} exists already: name another folder, nothing is overwritten")
+    types, left_out, count = typestore(), [], 0
+    rig = recording.rig
+    try:
+        with BagWriter(output, version=9, storage_plugin=StoragePlugin.MCAP) as bag:
+
+            def topic(name: str, kind: str) -> Connection:
+                return bag.add_connection(name, kind, typestore=types)
+
+            images = topic(LEFT_TOPIC, _IMAGES[0]), topic(RIGHT_TOPIC, _IMAGES[0])
+            infos = [topic(f"/{side}/camera_info", _CAMERA_INFO) for side in ("left", "right") if with_rig]
+            for index in range(len(recording)):
+                try:
+                    pair = recording.read(index)
+                except UnusablePair as error:
+                    left_out.append(str(error))
+                    continue
+                for number, frame in enumerate((pair.left, pair.right)):
+                    frame_id = f"{rig.name}_{('left', 'right')[number]}"
+                    at = frame.captured_at_ns
+                    bag.write(images[number], at, bytes(image_cdr(frame.image, at, frame_id)))
+                    if with_rig:
+                        bag.write(infos[number], at, _camera_info(rig, number, at, frame_id))
+                count += 1
+            if tracks:
+                strings = topic("/needletrack/track", "std_msgs/msg/String")
+                for at, message in tracks:
+                    text = types.types["std_msgs/msg/String"](data=message.decode())
+                    bag.write(strings, at, bytes(types.serialize_cdr(text, "std_msgs/msg/String")))
+    except OSError as error:
+        raise RecordingError(f"{output}: cannot be written: {error.strerror or error}") from error
+    return Copied(output, count, tuple(left_out))
+
+
+def _camera_info(rig: Rig, number: int, stamp_ns: int, frame_id: str) -> bytes:
+    types = typestore()
+    camera = (rig.left, rig.right)[number]
+    seconds, nanoseconds = divmod(stamp_ns, 1_000_000_000)
+    # Unrectified images: R is the identity, P holds the intrinsics alone.
+    projection = np.column_stack([camera.matrix, np.zeros(3)])
+    info = types.types[_CAMERA_INFO](
+        header=types.types["std_msgs/msg/Header"](
+            stamp=types.types["builtin_interfaces/msg/Time"](sec=seconds, nanosec=nanoseconds), frame_id=frame_id
+        ),
+        height=camera.size_px[1],
+        width=camera.size_px[0],
+        distortion_model="rational_polynomial" if len(camera.distortion) > 5 else "plumb_bob",
+        d=np.asarray(camera.distortion, np.float64),
+        k=camera.matrix.reshape(-1).astype(np.float64),
+        r=np.eye(3).reshape(-1),
+        p=projection.reshape(-1).astype(np.float64),
+        binning_x=0,
+        binning_y=0,
+        roi=types.types["sensor_msgs/msg/RegionOfInterest"](
+            x_offset=0, y_offset=0, height=0, width=0, do_rectify=False
+        ),
+    )
+    return bytes(types.serialize_cdr(info, _CAMERA_INFO))
+
+
+def _opened(path: Path) -> AnyReader:
+    if not path.exists():
+        raise RecordingError(f"{path}: there is no such recording")
+    try:
+        reader = AnyReader([path], default_typestore=typestore())
+        reader.open()
+    except AnyReaderError as error:
+        raise RecordingError(f"{path}: cannot be read as a ROS bag: {error}") from error
+    return reader
+
+
+def _two_topics(path: Path, reader: AnyReader, topics: tuple[str, str] | None) -> tuple[Connection, Connection]:
+    images = {each.topic: each for each in reader.connections if each.msgtype in _IMAGES}
+    here = f"its topics of images are {', '.join(sorted(images)) or 'none'}"
+    if topics is not None:
+        missing = [topic for topic in topics if topic not in images]
+        if missing or topics[0] == topics[1]:
+            raise RecordingError(f"{path}: no two topics of images {' and '.join(topics)}: {here}")
+        return images[topics[0]], images[topics[1]]
+    raw = [name for name, each in images.items() if each.msgtype == _IMAGES[0]]
+    for names in (raw, list(images)):
+        for left_word, right_word in _WORDS:
+            left = [name for name in names if left_word in name]
+            right = [name for name in names if right_word in name]
+            if len(left) == len(right) == 1 and left != right:
+                return images[left[0]], images[right[0]]
+    raise RecordingError(f"{path}: which topics are left and right? Say it with --left and --right: {here}")
+
+
+def _gray(message: Any) -> Image:
+    """The picture of a message as 8-bit gray (rows, columns), read-only; ValueError where it cannot be decoded."""
+    if not hasattr(message, "encoding"):
+        decoded = cv2.imdecode(np.frombuffer(message.data, np.uint8), cv2.IMREAD_UNCHANGED)
+        if decoded is None:
+            raise ValueError(f"a compressed image of format {message.format!r} that cannot be decoded")
+        pixels: Any = decoded
+        encoding = {2: "mono8", 3: "bgr8"}[pixels.ndim] if pixels.dtype == np.uint8 else "mono16"
+    else:
+        encoding = message.encoding
+        pixels = _raw(message)
+    if encoding in _BITS_16:
+        gray = (pixels >> 8).astype(np.uint8)
+    elif encoding in _TO_GRAY:
+        gray = cv2.cvtColor(np.ascontiguousarray(pixels), _TO_GRAY[encoding])
+    else:
+        gray = np.ascontiguousarray(pixels)
+    image: Image = np.array(gray, np.uint8)
+    image.flags.writeable = False
+    return image
+
+
+def _raw(message: Any) -> Any:
+    encoding = message.encoding
+    if encoding not in _GRAY | _BITS_16 | _TO_GRAY.keys():
+        raise ValueError(
+            f"the encoding {encoding!r} is none of {', '.join(sorted(_GRAY | _BITS_16 | _TO_GRAY.keys()))}"
+        )
+    rows = np.asarray(message.data, np.uint8).reshape(message.height, message.step)
+    if encoding in _GRAY:
+        return rows[:, : message.width]
+    if encoding in _BITS_16:
+        kind = ">u2" if message.is_bigendian else "<u2"
+        return np.ascontiguousarray(rows[:, : 2 * message.width]).view(kind)
+    channels = 4 if "a8" in encoding else 3
+    return rows[:, : channels * message.width].reshape(message.height, message.width, channels)

@@ -1,0 +1,306 @@
+"""The daemon with cameras of the tests' own making: cameras in, messages out to an outside subscriber."""
+
+import json
+import os
+import socket
+import subprocess
+import sys
+import threading
+import time
+import urllib.request
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import pytest
+from tests.capture.fake_kernel import FakeCamera, RunningKernel, two_cameras
+from tests.recording.small_recording import SIZE_PX, image_of, small_rig
+from typer.testing import CliRunner
+
+from needletrack.cli import app
+from needletrack.client import Received, Subscriber
+from needletrack.config import Config
+from needletrack.daemon.process import AlreadyRunning, OnlyInstance
+from needletrack.daemon.run import Daemon, DaemonSummary, ExitCode, exit_code
+from needletrack.errors import CaptureError, ConfigError, PublishError
+from needletrack.publish.message import StatusMessage, TrackMessage
+from needletrack.recording.asl import AslRecording
+from needletrack.recording.mcap_file import McapRecording
+from needletrack.records import Clock, StampPlace
+from needletrack.replay import Replay, open_recording
+from needletrack.rig import Rig, write_rig
+
+ROOT = Path(__file__).parents[2]
+STEER = ROOT / "tests" / "data" / "recordings" / "steer-b"
+# Only a hang takes so long.
+WAIT_S = 60.0
+
+
+def free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+def config_for(rig: Rig, **tables: Any) -> Config:
+    plain: dict[str, Any] = {
+        "cameras": {"size_px": rig.left.size_px, "rate_hz": 50.0, "left": {"id": "usb-1"}, "right": {"id": "usb-2"}},
+        "publishing": {"listen": [f"tcp/127.0.0.1:{free_port()}"], "heartbeat_s": 0.1},
+        # Real-time threads of a test would get in the way of others.
+        "daemon": {"metrics_port": 0, "realtime_priority": 0, "lock_memory": False},
+    }
+    for name, values in tables.items():
+        plain[name] = {**plain.get(name, {}), **values}
+    return Config.model_validate(plain)
+
+
+def noise(number: int) -> tuple[bytes, bytes]:
+    return image_of(number).tobytes(), image_of(number + 1).tobytes()
+
+
+class Running:
+    """A daemon in a thread of this process, a subscriber to it, and its summary once it was stopped."""
+
+    def __init__(
+        self, daemon: Daemon, subscriber: Subscriber, stop: threading.Event, done: Future[DaemonSummary]
+    ) -> None:
+        self.daemon, self.subscriber, self.done, self._stop = daemon, subscriber, done, stop
+
+    def next(self) -> Received:
+        received = self.subscriber.next(WAIT_S)
+        assert received is not None
+        return received
+
+    def until(self, condition: Callable[[Received], bool]) -> Received:
+        end_s = time.monotonic() + WAIT_S
+        while time.monotonic() < end_s:
+            received = self.next()
+            if condition(received):
+                return received
+        raise AssertionError("it never came")
+
+    def status(self, condition: Callable[[StatusMessage], bool]) -> StatusMessage:
+        end_s = time.monotonic() + WAIT_S
+        while time.monotonic() < end_s:
+            status = self.subscriber.status
+            if status is not None and condition(status):
+                return status
+            time.sleep(0.01)
+        raise AssertionError(f"it never came: {self.subscriber.status}")
+
+    def stop(self) -> DaemonSummary:
+        self._stop.set()
+        return self.done.result(WAIT_S)
+
+
+@contextmanager
+def running(rig: Rig, config: Config, kernel: RunningKernel) -> Iterator[Running]:
+    stop, ready = threading.Event(), threading.Event()
+    daemon = Daemon(rig, config, kernel=kernel)
+    with (
+        ThreadPoolExecutor(1) as pool,
+        Subscriber(rig.name, list(config.publishing.listen), capacity=4096) as subscriber,
+    ):
+        done = pool.submit(daemon.run, stop, ready=ready.set)
+        try:
+            while not ready.wait(0.05):
+                if done.done():
+                    done.result()
+            yield Running(daemon, subscriber, stop, done)
+        finally:
+            stop.set()
+
+
+def test_cameras_in_messages_out(tmp_path: Path) -> None:
+    rig, port = small_rig(), free_port()
+    config = config_for(rig, recording={"folder": tmp_path, "buffer_mb": 16}, daemon={"metrics_port": port})
+    kernel = RunningKernel(two_cameras(SIZE_PX), noise)
+    with running(rig, config, kernel) as daemon:
+        received = [daemon.next() for _ in range(20)]
+        status = daemon.status(lambda status: status.recording is not None and status.recording.pairs > 0)
+        metrics = urllib.request.urlopen(f"http://127.0.0.1:{port}/metrics", timeout=WAIT_S).read().decode()
+        # On this address of the loopback interface alone.
+        with pytest.raises(OSError, match="refused"):
+            urllib.request.urlopen(f"http://127.0.0.2:{port}/metrics", timeout=WAIT_S)
+        began_s = time.monotonic()
+        summary = daemon.stop()
+        took_s = time.monotonic() - began_s
+    assert took_s < 1
+    messages = [each.message for each in received]
+    stamps = {stamp_us * 1000 for stamp_us in kernel.stamps_us}
+    for message in messages:
+        assert message.captured_at_ns in stamps
+        assert (message.source, message.clock) == ("live", Clock.MONOTONIC)
+        assert (message.stamp_at, message.quality.pair_skew_us) == (StampPlace.START_OF_EXPOSURE, 40.0)
+        assert message.timing_ms is not None
+        assert message.latency_ms is not None
+        parts = sum(message.timing_ms[part] for part in ("capture", "queue", "track"))
+        # The rest is writing the message.
+        assert 0 <= message.latency_ms - parts < message.latency_ms
+    assert [b.sequence > a.sequence for a, b in pairwise(messages)] == [True] * 19
+    assert status.cameras is not None
+    assert {side: camera.state for side, camera in status.cameras.items()} == {
+        "left": "streaming",
+        "right": "streaming",
+    }
+    assert status.cameras["right"].node == "/dev/video1"
+    assert 'needletrack_tracks_total{status="invalid"}' in metrics
+    assert 'needletrack_camera_streaming{camera="left"} 1.0' in metrics
+    assert "needletrack_latency_seconds_count" in metrics
+    (file,) = tmp_path.glob("small-*.mcap")
+    recording = McapRecording(file)
+    assert len(recording) == summary.recorded
+    assert summary.recorded is not None
+    assert summary.unrecorded is not None
+    # The last pair may have come when the cameras were not asked any more.
+    assert kernel.delivered - 1 <= summary.recorded + summary.unrecorded <= kernel.delivered
+    assert recording.about.config == config.model_dump_json()
+    tracked = [TrackMessage.from_json(told) for _, told in recording.tracks()]
+    by_sequence = {message.sequence: message for message in tracked}
+    # The subscriber may have come a few pairs later.
+    assert [by_sequence[message.sequence] for message in messages] == messages
+    assert summary.run.pairs + sum(summary.run.dropped.values()) == summary.recorded + summary.unrecorded
+
+
+def test_a_camera_unplugged_is_told_and_back_within_two_seconds(caplog: pytest.LogCaptureFixture) -> None:
+    rig = small_rig()
+    cameras = two_cameras(SIZE_PX)
+    with running(rig, config_for(rig), RunningKernel(cameras, noise)) as daemon:
+        daemon.next()
+        cameras[1].plugged = False
+        status = daemon.status(lambda status: status.last_error is not None)
+        assert "usb-2" in str(status.last_error)
+        assert status.cameras is not None
+        assert status.cameras["right"].state == "absent"
+        while daemon.subscriber.next(0.3) is not None:
+            pass
+        cameras[1].node = "/dev/video7"
+        cameras[1].plugged, back_s = True, time.monotonic()
+        daemon.next()
+        assert time.monotonic() - back_s < 2
+        status = daemon.status(lambda status: status.cameras is not None and status.cameras["right"].restarts == 1)
+        assert status.cameras is not None
+        assert status.cameras["right"].node == "/dev/video7"
+
+
+def without_times(message: bytes) -> dict[str, Any]:
+    content: dict[str, Any] = json.loads(message)
+    of_the_run = ("run_id", "published_at_ns", "timing_ms", "latency_ms", "captured_at_unix_ns")
+    for name in (*of_the_run, "source", "clock"):
+        del content[name]
+    return content
+
+
+def test_recorded_live_and_replayed_give_the_same_bytes(tmp_path: Path) -> None:
+    recorded = AslRecording(STEER)
+    rig, cameras = recorded.rig, two_cameras(recorded.rig.left.size_px)
+    daemons: list[Daemon] = []
+
+    def one_at_a_time(number: int) -> tuple[bytes, bytes] | None:
+        # A pair comes when the one before it is done, so that none is overwritten.
+        service = daemons[0].service if daemons else None
+        if number == 5 or service is None or sum(service.statuses.values()) < number or service.busy_s:
+            return None
+        pair = recorded.read(number)
+        return pair.left.image.tobytes(), pair.right.image.tobytes()
+
+    config = config_for(rig, recording={"folder": tmp_path})
+    with running(rig, config, RunningKernel(cameras, one_at_a_time)) as daemon:
+        daemons.append(daemon.daemon)
+        live = [daemon.next().message for _ in range(5)]
+        summary = daemon.stop()
+    assert summary.run.dropped == {}
+    assert any(message.centerline_mm for message in live)
+    (file,) = tmp_path.glob("*.mcap")
+    published = [told for _, told in McapRecording(file).tracks()]
+    assert published == [message.to_json() for message in live]
+    output = tmp_path / "replayed.jsonl"
+    Replay(open_recording(file, config), config).run(threading.Event(), output=output)
+    replayed = output.read_bytes().splitlines()
+    for ours, again in zip(published, replayed, strict=True):
+        assert json.dumps(without_times(ours)).encode() == json.dumps(without_times(again)).encode()
+
+
+def test_a_second_daemon_of_the_rig_is_refused(tmp_path: Path) -> None:
+    rig = small_rig()
+    with OnlyInstance(rig.name):
+        daemon = Daemon(rig, config_for(rig), kernel=RunningKernel(two_cameras(SIZE_PX), noise))
+        with pytest.raises(AlreadyRunning, match="already runs on this machine"):
+            daemon.run(threading.Event())
+    with OnlyInstance(rig.name):
+        pass
+
+
+@pytest.mark.parametrize(
+    ("error", "code"),
+    [(AlreadyRunning(""), 4), (CaptureError(""), 3), (ConfigError(""), 2), (PublishError(""), 2)],
+)
+def test_every_error_has_its_exit_code(error: Exception, code: int) -> None:
+    assert exit_code(error) is ExitCode(code)
+
+
+def test_a_camera_that_cannot_do_it_ends_the_start() -> None:
+    rig = small_rig()
+    camera = FakeCamera("/dev/video0", "usb-1", formats={"YUYV": [SIZE_PX]})
+    with pytest.raises(CaptureError, match="does not do GREY"):
+        Daemon(rig, config_for(rig), kernel=RunningKernel([camera], noise)).run(threading.Event())
+
+
+def test_images_of_another_size_than_the_rigs_are_refused() -> None:
+    with pytest.raises(ConfigError, match=r"cameras\.size_px is 1280x1024, but rig small was calibrated at 64x48"):
+        Daemon(small_rig(), config_for(small_rig(), cameras={"size_px": (1280, 1024)}))
+
+
+def test_systemd_is_told_when_it_is_ready_that_it_lives_and_that_it_stops(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "notify"
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as systemd:
+        systemd.bind(str(path))
+        systemd.settimeout(WAIT_S)
+        monkeypatch.setenv("NOTIFY_SOCKET", str(path))
+        monkeypatch.setenv("WATCHDOG_USEC", "200000")
+        monkeypatch.setenv("WATCHDOG_PID", str(os.getpid()))
+        rig = small_rig()
+        with running(rig, config_for(rig), RunningKernel(two_cameras(SIZE_PX), noise)) as daemon:
+            assert systemd.recv(4096).startswith(b"READY=1\n")
+            daemon.next()
+            alive = systemd.recv(4096)
+            while b"left streaming" not in alive:
+                alive = systemd.recv(4096)
+            assert alive.startswith(b"WATCHDOG=1\n")
+            daemon.stop()
+            while (told := systemd.recv(4096)).startswith(b"WATCHDOG=1"):
+                pass
+            assert told == b"STOPPING=1"
+
+
+def test_the_command_says_what_is_wrong_in_one_line_with_its_code(tmp_path: Path) -> None:
+    write_rig(small_rig(), tmp_path / "rig.yaml")
+    (tmp_path / "small.toml").write_text("[cameras]\nsize_px = [64, 48]\n")
+    runner, rig = CliRunner(), str(tmp_path / "rig.yaml")
+    for options, code, told in (
+        ([], 2, "no rig: name one with --rig"),
+        (["--rig", rig], 2, "cameras.size_px is 1280x1024"),
+        (["--rig", rig, "--config", str(tmp_path / "small.toml")], 3, "cameras.left.id is not configured"),
+    ):
+        result = runner.invoke(app, ["run", *options])
+        assert result.exit_code == code, result.stderr
+        assert told in result.stderr.splitlines()[-1]
+        assert result.stdout == ""
+
+
+def test_logs_are_json_lines_with_rig_and_run() -> None:
+    code = (
+        "import logging, sys; from needletrack.daemon.logs import configure_logs;"
+        "configure_logs({'rig': 'r1', 'run_id': 'x'});"
+        "logging.getLogger('needletrack.capture.live').warning('left %s', 'gone', extra={'node': '/dev/video0'})"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    line = json.loads(done.stderr)
+    assert done.stdout == ""
+    assert (line["event"], line["level"], line["rig"], line["run_id"]) == ("left gone", "warning", "r1", "x")
+    assert (line["node"], line["logger"]) == ("/dev/video0", "needletrack.capture.live")

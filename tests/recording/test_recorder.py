@@ -1,0 +1,213 @@
+"""The recorder: what is offered is on the disk, and nothing that the disk does holds anybody up."""
+
+import errno
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from tests.recording.small_recording import SIZE_PX, image_of, small_rig
+
+from needletrack.errors import RecordingError
+from needletrack.publish.message import Instant, RunContext, Source, TrackMessage
+from needletrack.recording import recorder as recorder_module
+from needletrack.recording.mcap_file import About, McapRecording, PairWriter, recover
+from needletrack.recording.recorder import Recorder, RecorderSettings
+from needletrack.records import Clock, Frame, NeedleTrack, Reason, StampPlace, Status, StereoPair
+
+MS = 1_000_000
+ABOUT = About(rig=small_rig(), name="small", config="{}")
+# Only a hang takes so long.
+WAIT_S = 60.0
+
+
+def pair(number: int) -> StereoPair:
+    stamp = 1_000 * MS + number * 10 * MS
+    frames = Frame(image_of(stamp), stamp), Frame(image_of(stamp + 1), stamp + 5_000)
+    place = StampPlace.START_OF_EXPOSURE
+    return StereoPair(*frames, sequence=number, clock=Clock.MONOTONIC, exposure_ns=2 * MS, stamp_at=place)
+
+
+def message(of: StereoPair) -> tuple[NeedleTrack, TrackMessage]:
+    track = NeedleTrack(of.captured_at_ns, Status.INVALID, (Reason.NO_CANDIDATE,))
+    run = RunContext("small", Source.LIVE, "c" * 12, "d" * 12)
+    return track, TrackMessage.from_track(track, of, run, dropped={}, published=Instant.now())
+
+
+def wait_for(condition: Callable[[], bool]) -> None:
+    until = time.monotonic() + WAIT_S
+    while not condition():
+        assert time.monotonic() < until
+        time.sleep(0.01)
+
+
+def test_pairs_and_tracks_are_in_the_file(tmp_path: Path) -> None:
+    file = tmp_path / "r.mcap"
+    messages = []
+    with Recorder(RecorderSettings(tmp_path, file), ABOUT, SIZE_PX) as recorder:
+        for number in range(20):
+            offered = pair(number)
+            assert recorder.offer(offered)
+            track, told = message(offered)
+            messages.append(told)
+            recorder.take(offered, track, told)
+    assert (recorder.offered, recorder.recorded, recorder.dropped) == (20, 20, 0)
+    assert (recorder.state.pairs, recorder.state.error) == (20, None)
+    recording = McapRecording(file)
+    assert [told for _, told in recording.tracks()] == [told.to_json() for told in messages]
+    for number in range(20):
+        read, offered = recording.read(number), pair(number)
+        assert np.array_equal(read.left.image, offered.left.image)
+        assert np.array_equal(read.right.image, offered.right.image)
+        assert (read.captured_at_ns, read.skew_us) == (offered.captured_at_ns, 5.0)
+    about = recording.about
+    assert (about.clock, about.exposure_ns, about.stamp_at) == (Clock.MONOTONIC, 2 * MS, StampPlace.START_OF_EXPOSURE)
+
+
+def test_a_recorder_that_does_not_keep_up_costs_counted_pairs_and_no_time(tmp_path: Path) -> None:
+    rig = small_rig((2000, 1500))
+    picture = np.zeros((1500, 2000), np.uint8)
+    big = StereoPair(Frame(picture, 1), Frame(picture, 1), 0)
+    # Memory for the least number of pairs, four.
+    settings = RecorderSettings(tmp_path, tmp_path / "r.mcap", buffer_mb=16)
+    with Recorder(settings, replace(ABOUT, rig=rig), (2000, 1500)) as recorder:
+        assert recorder.pid is not None
+        os.kill(recorder.pid, signal.SIGSTOP)
+        taken = [recorder.offer(big) for _ in range(10)]
+        os.kill(recorder.pid, signal.SIGCONT)
+        wait_for(lambda: recorder.offer(big))
+    assert taken == [True] * 4 + [False] * 6
+    assert recorder.offered == recorder.recorded + recorder.dropped
+    assert recorder.recorded == len(McapRecording(tmp_path / "r.mcap"))
+
+
+def test_a_recorder_that_is_killed_is_told_and_tracking_goes_on(tmp_path: Path) -> None:
+    with Recorder(RecorderSettings(tmp_path, tmp_path / "r.mcap"), ABOUT, SIZE_PX) as recorder:
+        recorder.offer(pair(0))
+        assert recorder.pid is not None
+        os.kill(recorder.pid, signal.SIGKILL)
+        wait_for(lambda: not recorder.offer(pair(1)))
+    assert recorder.offered == recorder.recorded + recorder.dropped
+
+
+RECORD = """
+import sys, time
+from pathlib import Path
+from tests.recording.test_recorder import ABOUT, SIZE_PX, pair
+from needletrack.recording.recorder import Recorder, RecorderSettings
+if __name__ == "__main__":
+    recorder = Recorder(RecorderSettings(Path(sys.argv[1]), Path(sys.argv[1]) / "r.mcap"), ABOUT, SIZE_PX)
+    for number in range(2000):
+        while not recorder.offer(pair(number % 50)):
+            time.sleep(0.01)
+    while recorder.recorded < 2000:
+        recorder._collect(0.1)
+    print(recorder.pid, flush=True)
+    time.sleep(600)
+"""
+
+
+@pytest.mark.parametrize("both", [False, True])
+def test_after_a_sigkill_nothing_but_the_unwritten_tail_is_lost(tmp_path: Path, both: bool) -> None:
+    script = tmp_path / "record.py"
+    script.write_text(RECORD)
+    root = Path(__file__).parents[2]
+    with subprocess.Popen(
+        [sys.executable, script, tmp_path],
+        stdout=subprocess.PIPE,
+        text=True,
+        env={**os.environ, "PYTHONPATH": str(root)},
+    ) as process:
+        assert process.stdout is not None
+        writing = int(process.stdout.readline())
+        if both:
+            os.kill(writing, signal.SIGKILL)
+        process.kill()
+    file = tmp_path / "r.mcap"
+    if both:
+        # A chunk of 8 MB holds 1300 of these small pairs.
+        assert recover(file, tmp_path / "saved.mcap").pairs >= 2000 - 1366
+        return
+    # The daemon alone was killed: the writing process notices and finishes the file.
+    wait_for(lambda: not Path(f"/proc/{writing}").exists())
+    assert len(McapRecording(file)) == 2000
+
+
+def test_a_disk_with_too_little_space_pauses_before_the_first_pair(tmp_path: Path) -> None:
+    with pytest.raises(RecordingError, match=r"recording\.min_free_mb is 1000000000: free some space"):
+        Recorder(RecorderSettings(tmp_path, min_free_mb=10**9), ABOUT, SIZE_PX)
+
+
+@pytest.mark.parametrize("number", [errno.ENOSPC, errno.EROFS, errno.EIO])
+def test_an_error_of_the_disk_pauses_and_a_new_file_follows(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: int
+) -> None:
+    files = recorder_module._Files(RecorderSettings(tmp_path, min_free_mb=0), ABOUT)
+    faults: list[OSError] = []
+    usual = PairWriter.add_pair
+
+    def add_pair(self: Any, *arguments: Any) -> None:
+        if faults:
+            raise faults[0]
+        usual(self, *arguments)
+
+    monkeypatch.setattr(PairWriter, "add_pair", add_pair)
+    now = [1000.0]
+    monkeypatch.setattr(time, "monotonic", lambda: now[0])
+
+    def add(n: int) -> bool:
+        command = recorder_module._Pair(0, n, n * MS, n * MS, None)
+        return files.add_pair(command, image_of(n), image_of(n))
+
+    assert add(0)
+    faults.append(OSError(number, os.strerror(number)))
+    assert not add(1)
+    assert os.strerror(number) in str(files.state.error)
+    faults.clear()
+    assert not add(2), "it is tried again after a while, not with every pair"
+    now[0] += 6
+    assert add(3)
+    assert files.state.error is None
+    files.finish()
+    first, second = sorted(tmp_path.glob("small-*.mcap"))
+    assert len(McapRecording(second)) == 1
+    with pytest.raises(RecordingError, match="recover"):
+        McapRecording(first)
+
+
+def test_a_new_file_after_so_many_megabytes(tmp_path: Path) -> None:
+    settings = RecorderSettings(tmp_path, tmp_path / "r.mcap", min_free_mb=0, max_file_mb=16)
+    picture = np.random.default_rng(0).integers(0, 256, (1024, 1280), dtype=np.uint8)
+    big = StereoPair(Frame(picture, 1), Frame(picture, 1), 0)
+    with Recorder(settings, replace(ABOUT, rig=small_rig((1280, 1024))), (1280, 1024)) as recorder:
+        for _ in range(20):
+            wait_for(lambda: recorder.offer(big))
+    files = [McapRecording(tmp_path / name) for name in ("r.mcap", "r-1.mcap", "r-2.mcap")]
+    assert sum(map(len, files)) == 20 == recorder.state.pairs
+    assert max(file.folder.stat().st_size for file in files) < 28e6
+
+
+def test_what_cannot_be_written_is_told_at_once(tmp_path: Path) -> None:
+    (tmp_path / "there.mcap").touch()
+    with pytest.raises(RecordingError, match="nothing is overwritten"):
+        Recorder(RecorderSettings(tmp_path, tmp_path / "there.mcap"), ABOUT, SIZE_PX)
+    with pytest.raises(RecordingError, match="make it first"):
+        Recorder(RecorderSettings(tmp_path, tmp_path / "no" / "r.mcap"), ABOUT, SIZE_PX)
+    (tmp_path / "file").touch()
+    with pytest.raises(RecordingError, match=r"recording\.folder"):
+        Recorder(RecorderSettings(tmp_path / "file"), ABOUT, SIZE_PX)
+
+
+def test_an_idle_recorder_has_everything_on_the_disk(tmp_path: Path) -> None:
+    file = tmp_path / "r.mcap"
+    with Recorder(RecorderSettings(tmp_path, file), ABOUT, SIZE_PX) as recorder:
+        recorder.offer(pair(0))
+        wait_for(lambda: file.exists() and file.stat().st_size > 6000)
+        assert recover(file, tmp_path / "saved.mcap").pairs == 1

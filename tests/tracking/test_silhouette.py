@@ -1,5 +1,6 @@
 """Where one view puts the axis of a straight needle whose picture is drawn exactly, whatever its inside shows."""
 
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -33,7 +34,7 @@ def sections(look: Look, wide_mm: float = 0.9, aside_mm: float = 0.0, seed: int 
 
 
 def evidence(cut: Sections, appearance: Appearance, grid: Grid = WIDE) -> AxisEvidence:
-    return axis_evidence(cut, appearance, np.full(COUNT, appearance.half_width), grid, np.zeros(COUNT, np.bool_))
+    return axis_evidence(cut, appearance, np.full(COUNT, appearance.half_width), grid)
 
 
 def common_offset_px(view: AxisEvidence) -> tuple[float, float]:
@@ -158,7 +159,7 @@ def test_what_is_before_clutter_counts_for_less_where_a_streak_leads() -> None:
     found = Appearance(16, 2, 0)
     half_widths = np.full(COUNT, found.half_width)
     alone, led = (
-        axis_evidence(cut, found, half_widths, NEAR, np.full(COUNT, shines)).offsets(
+        replace(axis_evidence(cut, found, half_widths, NEAR), shines=np.full(COUNT, shines)).offsets(
             np.zeros(COUNT), np.full(COUNT, 0.4)
         )
         for shines in (False, True)
@@ -203,7 +204,7 @@ def test_what_is_outside_the_image_or_too_thin_is_not_seen() -> None:
     assert np.isneginf(expected(view)[out]).all()
     assert not view.offsets(np.zeros(COUNT), np.full(COUNT, 0.4)).seen[out].any()
     half_widths = np.where(np.arange(COUNT) < 10, -1, found.half_width)
-    thin = axis_evidence(cut, found, half_widths, NEAR, np.zeros(COUNT, np.bool_))
+    thin = axis_evidence(cut, found, half_widths, NEAR)
     seen = thin.offsets(np.zeros(COUNT), np.full(COUNT, 0.4)).seen
     assert not seen[:10].any()
     assert seen[15:35].all()

@@ -1,14 +1,14 @@
 """The curve adjusted to both silhouettes: observe, fit one spline in space, expect, observe again."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from needletrack.geometry.spline import arc_length
+from needletrack.geometry.spline import arc_length, basis
 from needletrack.geometry.stereo import StereoRig
 from needletrack.records import Appearance, Float, Image, Int
 from needletrack.tracking.clipped import WHITE, WORTH_A_LOOK, Flanks, clipped_axis, clipped_share
-from needletrack.tracking.evidence import HALF_WIDTHS, LIVELY, NEAR, WIDE, Grid
+from needletrack.tracking.evidence import FINE, HALF_WIDTHS, LIVELY, NEAR, WIDE, Grid
 from needletrack.tracking.fit import CurveFit, CurveFitting, Ends, FitParameters, StreakObservation
 from needletrack.tracking.needle import Needle
 from needletrack.tracking.profile import Mask
@@ -36,7 +36,7 @@ class Looks:
 
 # At a rough curve; at one that was adjusted and then lengthened; at that of the pair before; at one that is settled.
 ROUGH, GROWING = Looks((0.7, 0.5, 0.4), WIDE, with_streak=False), Looks((0.7, 0.4), WIDE, with_streak=False)
-MOVED, SETTLED = Looks((0.7, 0.4), WIDE), Looks((0.4, 0.2), NEAR)
+MOVED, SETTLED = Looks((0.7, 0.4, 0.2), FINE), Looks((0.4, 0.2), NEAR)
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,6 +53,7 @@ class Adjusted:
     support: Float
     shines: Mask
     flanks: Flanks | None = None
+    fitting: CurveFitting | None = None
 
     def part(self, start: int, stop: int) -> "Adjusted":
         """The points start <= i < stop alone."""
@@ -75,6 +76,41 @@ class Adjusted:
             self.shines[:, cut],
             self.flanks,
         )
+
+
+def brought_to_end(
+    adjusted: Adjusted, at_mm: float, ends: Ends, spacing_mm: float, parameters: FitParameters
+) -> Adjusted:
+    """The adjusted curve fitted once more, to the ends that both views show as well, and cut there.
+
+    at_mm: the end along the curve. The curve reaches beyond it.
+    """
+    if adjusted.fitting is None:
+        raise ValueError("a curve that was cut cannot be fitted once more")
+    fit = adjusted.fitting.fit(adjusted.observed, ends, parameters.systematic_px[adjusted.appearance.inside])
+    arc = arc_length(fit.points_mm)
+    count = max(8, round(at_mm / spacing_mm) + 1)
+    cut = np.interp(np.linspace(0.0, at_mm, count), arc, fit.parameters)
+    # What was seen of a section is told of the point of the curve next to it.
+    nearest = np.abs(fit.parameters - cut[:, None]).argmin(axis=1)
+    nearest[-1] = ends[0][0].index
+    points = basis(cut, len(fit.control_mm)) @ fit.control_mm
+    left, right = adjusted.observed
+    return Adjusted(
+        CurveFit(
+            cut,
+            fit.control_mm,
+            fit.covariance_mm2,
+            points,
+            fit.residual_px[:, nearest],
+            fit.rms_px,
+            fit.streak_misfit,
+        ),
+        (left.part(nearest), right.part(nearest)),
+        adjusted.appearance,
+        adjusted.support[:, nearest],
+        adjusted.shines[:, nearest],
+    )
 
 
 def adjust(
@@ -107,14 +143,19 @@ def adjust(
         is_white = bool(clipped_share(images, rig, points_mm).min() > WHITE)
         appearance = estimate_appearance((sections[0], sections[1]), needle, appearance, looks.grid, is_white=is_white)
     half_widths = _half_widths(len(points_mm), appearance, before_tip)
+    evidence = [axis_evidence(each, appearance, half_widths, looks.grid) for each in sections]
+    if looks is SETTLED:
+        expected: list[Float] = [np.zeros(len(points_mm))] * 2
+    else:
+        expected = [each.likeliest_motion_px() if looks is MOVED else each.likeliest_path_px() for each in evidence]
     streaks: list[Streak | None] = [None, None]
     if looks.with_streak and appearance.inside == LIVELY:
-        streaks = [find_streak(each.values, _units(half_widths)) for each in sections]
+        streaks = [
+            find_streak(each.values, _units(half_widths), at / each.px_per_unit)
+            for each, at in zip(sections, expected, strict=True)
+        ]
     shines = np.stack([np.zeros(len(points_mm), np.bool_) if each is None else each.seen for each in streaks])
-    evidence = [
-        axis_evidence(each, appearance, half_widths, looks.grid, led)
-        for each, led in zip(sections, shines, strict=True)
-    ]
+    evidence = [replace(each, shines=led) for each, led in zip(evidence, shines, strict=True)]
     left_line, right_line = (
         None if streak is None else _line(streak, each, appearance)
         for each, streak in zip(sections, streaks, strict=True)
@@ -141,10 +182,6 @@ def adjust(
         return left, right
 
     systematic_px = parameters.systematic_px[appearance.inside]
-    if looks is SETTLED:
-        expected: list[Float] = [np.zeros(len(points_mm))] * 2
-    else:
-        expected = [each.likeliest_motion_px() if looks is MOVED else each.likeliest_path_px() for each in evidence]
     for spread in spreads[:-1]:
         fitting.approach(look(expected, spread), ends)
         expected = across(fitting.points_mm())
@@ -153,7 +190,7 @@ def adjust(
     expected = across(fit.points_mm)
     support = np.stack([each.support(at, spreads[-1]) for each, at in zip(evidence, expected, strict=True)])
     if looks is not SETTLED:
-        return Adjusted(fit, observed, appearance, support, shines)
+        return Adjusted(fit, observed, appearance, support, shines, None, fitting)
     is_shaft = _is_shaft(points_mm, before_tip, needle)
     if clipped_share(images, rig, fit.points_mm).max() < WORTH_A_LOOK:
         return Adjusted(fit, observed, appearance, support, shines)

@@ -53,8 +53,8 @@ class Grid:
         return np.asarray(CubicSpline(self.shifts, np.eye(len(self.shifts)))(self.fine_shifts))
 
 
-# Where the axis is nearly known, and where it is not.
-NEAR, WIDE, _HERE = Grid(4, 12), Grid(2, 14), Grid(1, 0)
+# Where the axis is nearly known; where it is not; and where it has to be found and known at one look.
+NEAR, WIDE, FINE, _HERE = Grid(4, 12), Grid(2, 14), Grid(4, 28), Grid(1, 0)
 # Sigmas of the lens blur, and half widths (a step of 4 %), for which there are matrices.
 BLURS = (0.45, 0.55, 0.68, 0.84, 1.05, 1.3)
 HALF_WIDTHS = 1.2 * 1.04 ** np.arange(0, 34)

@@ -15,8 +15,9 @@ from needletrack.geometry.spline import arc_length, resample, unit
 from needletrack.geometry.stereo import StereoRig
 from needletrack.geometry.transform import RigidTransform
 from needletrack.records import Appearance, Float, NeedleTrack, Reason
-from needletrack.tracking.adjust import GROWING, MOVED, ROUGH, SETTLED, Adjusted, Images, adjust
+from needletrack.tracking.adjust import GROWING, MOVED, ROUGH, SETTLED, Adjusted, Images, adjust, brought_to_end
 from needletrack.tracking.beside import Beside, BesideParameters, look_beside
+from needletrack.tracking.clipped import WORTH_A_LOOK, clipped_share
 from needletrack.tracking.ends import (
     TIP_BEFORE_MM,
     TIP_BEYOND_MM,
@@ -62,6 +63,8 @@ _GOES_ON_MM = 1.5
 _ADVANCE_SIGMA_MM_S = 18.0
 # Images without stamps are of a sequence as fast as cameras are.
 _USUAL_S = 1 / 30
+# And this far beyond where it is expected the curve is kept, mm.
+_STEADY_BEYOND_MM = 3.0
 # Weaknesses of a track that is followed nevertheless: its shape is that of the needle, to its end.
 _STEADY_DESPITE = {Reason.TIP_DISAGREES, Reason.HIGH_UNCERTAINTY}
 # Between two pairs the tip is not expected to come further than this.
@@ -152,6 +155,8 @@ def refine(
     where no sleeve is seen; without it the curve is a rough one. since_s: how long ago it was taken; 0: nobody knows.
     """
     steady = _steady(previous, since_s, models.needle)
+    if steady is not None and not steady.is_due and clipped_share(images, rig, steady.points_mm).max() < WORTH_A_LOOK:
+        return _refined_steady(images, rig, steady, models)
     if steady is None:
         followed = _follow(images, rig, points_mm, models, previous)
     else:
@@ -192,23 +197,7 @@ def refine(
         if abs(ended.tip.at_mm - float(arc_length(adjusted.fit.points_mm)[-1])) > _TIP_MOVED_MM:
             # Beyond its tip the curve was a guess, and so was what lay about it.
             ended = _ended(images, rig, ended.final.fit.points_mm, ended.final, models)
-    tip, along_mm, final, ends = ended.tip, ended.along_mm, ended.final, ended.ends
-    tip_px = np.stack([_tip_px(view, end[0]) for view, end in zip(final.observed, ends, strict=True)])
-    beyond = _cut(along_mm, max(0.0, tip.at_mm - TIP_BEFORE_MM), tip.at_mm + TIP_BEYOND_MM, spacing)
-    beside = _look_beside(images, rig, beyond, seen_diameter_mm, models)
-    is_free = not is_crossed(beside, min(tip.at_mm, TIP_BEFORE_MM), arc_length(beyond), models.ends)
-    return Refined(
-        final.fit,
-        final.observed,
-        np.stack([view.seen for view in final.observed]) | final.shines,
-        replace(final.appearance, taper_mm=tip.taper_mm),
-        diameter_mm(final.appearance, models.needle) if final.flanks is None else final.flanks.diameter_mm,
-        base_is_known,
-        tip,
-        is_free,
-        tip_px,
-        float(np.clip(final.support, -_MOST_ODDS, _MOST_ODDS).sum()),
-    )
+    return _with_tip(images, rig, ended, models, base_is_known=base_is_known)
 
 
 @dataclass(frozen=True, slots=True)
@@ -237,6 +226,61 @@ class _Ended:
     ends: Ends
 
 
+def _refined_steady(images: Images, rig: StereoRig, steady: _Steady, models: RefineModels) -> Refined:
+    """The needle where it was moved to since, looked at once: what it looks like and where its base is are known."""
+    spacing = models.refine.spacing_mm
+    foreseen_mm = float(arc_length(steady.points_mm)[-1])
+    foreseen_mm += float(np.clip(steady.advance_mm, -_MOST_ADVANCE_MM, _MOST_ADVANCE_MM))
+    beyond_mm = _beyond(steady.points_mm, round((_MOST_ADVANCE_MM + _STEADY_BEYOND_MM) / spacing), spacing)
+    points = _cut(np.concatenate([steady.points_mm, beyond_mm]), 0.0, foreseen_mm + _STEADY_BEYOND_MM, spacing)
+    before_tip_mm = foreseen_mm - arc_length(points)
+    moved = adjust(
+        images,
+        rig,
+        points,
+        models.needle,
+        models.fit,
+        steady.appearance,
+        looks=MOVED,
+        looks_the_same=True,
+        before_tip=(np.maximum(before_tip_mm, 0.0), steady.taper_mm),
+        bent_for_s=steady.since_s,
+    )
+    tip, along_mm = _tip(images, rig, moved.fit.points_mm[before_tip_mm >= 0], moved, models, steady)
+    if tip.at_mm < models.needle.min_length_mm / 2:
+        raise NeedleNotFound("refine", Reason.TOO_SHORT)
+    arc = arc_length(moved.fit.points_mm)
+    index = int(np.abs(arc - tip.at_mm).argmin())
+    left, right = (
+        (_end_observation(moved.fit.points_mm, index, camera, pose, each - arc[index], sigma),)
+        for camera, pose, each, sigma in zip(*_views(rig), tip.each_mm, tip.sigma_mm, strict=True)
+    )
+    final = brought_to_end(moved, min(tip.at_mm, float(arc[-1])), (left, right), spacing, models.fit)
+    return _with_tip(images, rig, _Ended(tip, along_mm, final, (left, right)), models, base_is_known=True)
+
+
+def _with_tip(images: Images, rig: StereoRig, ended: _Ended, models: RefineModels, *, base_is_known: bool) -> Refined:
+    tip, final = ended.tip, ended.final
+    seen_diameter_mm = diameter_mm(final.appearance, models.needle)
+    tip_px = np.stack([_tip_px(view, end[0]) for view, end in zip(final.observed, ended.ends, strict=True)])
+    start_mm = max(0.0, tip.at_mm - TIP_BEFORE_MM)
+    beyond = _cut(ended.along_mm, start_mm, tip.at_mm + TIP_BEYOND_MM, models.refine.spacing_mm)
+    beside = _look_beside(images, rig, beyond, seen_diameter_mm, models)
+    is_free = not is_crossed(beside, min(tip.at_mm, TIP_BEFORE_MM), arc_length(beyond), models.ends)
+    return Refined(
+        final.fit,
+        final.observed,
+        np.stack([view.seen for view in final.observed]) | final.shines,
+        replace(final.appearance, taper_mm=tip.taper_mm),
+        seen_diameter_mm if final.flanks is None else final.flanks.diameter_mm,
+        base_is_known,
+        tip,
+        is_free,
+        tip_px,
+        float(np.clip(final.support, -_MOST_ODDS, _MOST_ODDS).sum()),
+    )
+
+
 def _ended(
     images: Images,
     rig: StereoRig,
@@ -251,7 +295,7 @@ def _ended(
         raise NeedleNotFound("refine", Reason.TOO_SHORT)
     visible = _cut(along_mm, 0.0, tip.at_mm, models.refine.spacing_mm)
     left, right = (
-        (_end_observation(visible, camera, pose, each - tip.at_mm, sigma),)
+        (_end_observation(visible, len(visible) - 1, camera, pose, each - tip.at_mm, sigma),)
         for camera, pose, each, sigma in zip(*_views(rig), tip.each_mm, tip.sigma_mm, strict=True)
     )
     final = adjust(
@@ -338,12 +382,12 @@ def _goes_on(
 
 
 def _end_observation(
-    points_mm: Float, camera: Camera, pose: RigidTransform, ahead_mm: float, sigma_mm: float
+    points_mm: Float, index: int, camera: Camera, pose: RigidTransform, ahead_mm: float, sigma_mm: float
 ) -> EndObservation:
-    last_px = camera.project(pose.apply(points_mm[-2:]))
-    spacing_mm = float(np.linalg.norm(points_mm[-1] - points_mm[-2]))
-    px_per_mm = float(np.linalg.norm(last_px[1] - last_px[0])) / spacing_mm
-    return EndObservation(len(points_mm) - 1, ahead_mm * px_per_mm, max(0.5, sigma_mm * px_per_mm))
+    about = points_mm[[max(0, index - 1), min(index + 1, len(points_mm) - 1)]]
+    px = camera.project(pose.apply(about))
+    px_per_mm = float(np.linalg.norm(px[1] - px[0]) / np.linalg.norm(about[1] - about[0]))
+    return EndObservation(index, ahead_mm * px_per_mm, max(0.5, sigma_mm * px_per_mm))
 
 
 def _tip_px(view: AxisOffsets, end: EndObservation) -> Float:
@@ -438,7 +482,7 @@ def _may_go_on(images: Images, rig: StereoRig, part: Adjusted, reach_mm: float, 
         beyond = _beyond(outwards, len(half_width), spacing)
         for image, camera, pose in zip(images, *_views(rig), strict=True):
             sections = cut_sections(image, camera, pose.apply(beyond), models.needle)
-            evidence = axis_evidence(sections, part.appearance, half_width, WIDE, np.zeros(len(beyond), np.bool_))
+            evidence = axis_evidence(sections, part.appearance, half_width, WIDE)
             most = np.where(sections.inside, evidence.log_evidence.max(axis=1), -np.inf)
             shown = max(shown, int((most > models.refine.shown_log_odds).sum()))
     return shown * spacing > _GOES_ON_MM

@@ -96,7 +96,7 @@ class AxisOffsets:
         """Where the view shows the needle, (N,) bool."""
         return np.isfinite(self.sigma_px)
 
-    def part(self, cut: slice) -> "AxisOffsets":
+    def part(self, cut: slice | Int) -> "AxisOffsets":
         """The points of the cut alone."""
         return AxisOffsets(self.center_px[cut], self.normal[cut], self.offset_px[cut], self.sigma_px[cut])
 
@@ -197,13 +197,15 @@ def estimate_appearance(
 class AxisEvidence:
     """One view's sections with the log evidence (N, S) of the axis in each, over that of no needle there.
 
-    beside_clutter (N,): where it is seen before a background that is not even, and a streak shows its way.
+    cluttered (N,): where it is seen before a background that is not even. shines (N,): where a streak of light shows
+    its way as well.
     """
 
     sections: Sections
     log_evidence: Float
-    beside_clutter: Mask
+    cluttered: Mask
     grid: Grid
+    shines: Mask
 
     def offsets(self, expected_px: Float, spread: Float) -> AxisOffsets:
         """The axis where it is expected at expected_px (N,), give or take spread (N,) units."""
@@ -214,7 +216,7 @@ class AxisEvidence:
             self.sections.center_px,
             self.sections.normal,
             np.where(seen, offset, 0.0) * scale,
-            np.where(seen, sigma * np.where(self.beside_clutter, _CLUTTERED, 1.0), np.inf) * scale,
+            np.where(seen, sigma * np.where(self.cluttered & self.shines, _CLUTTERED, 1.0), np.inf) * scale,
         )
 
     def likeliest_path_px(self) -> Float:
@@ -269,13 +271,8 @@ class AxisEvidence:
         return np.asarray(np.exp(curve - curve.max(axis=1, keepdims=True)) + np.exp(_LOG_OUTLIER))
 
 
-def axis_evidence(
-    sections: Sections, appearance: Appearance, half_widths: Int, grid: Grid, shines: Mask
-) -> AxisEvidence:
-    """The evidence of sections whose half widths (N,), as indices into HALF_WIDTHS, differ; -1: too thin to say.
-
-    shines (N,): where a streak of light shows the needle's way as well.
-    """
+def axis_evidence(sections: Sections, appearance: Appearance, half_widths: Int, grid: Grid) -> AxisEvidence:
+    """The evidence of sections whose half widths (N,), as indices into HALF_WIDTHS, differ; -1: too thin to say."""
     log = np.full((len(sections.values), len(grid.shifts)), -np.inf)
     cluttered = np.zeros(len(log), dtype=np.bool_)
     for width in np.unique(half_widths[half_widths >= 0]):
@@ -285,7 +282,7 @@ def axis_evidence(
         before_even, before_clutter = log_evidence_by_background(shown, each, grid)
         log[rows] = either(before_even, before_clutter) - log_evidence_of_no_needle(shown, appearance.blur)[:, None]
         cluttered[rows] = before_clutter.max(axis=1) > before_even.max(axis=1)
-    return AxisEvidence(sections, log, cluttered & shines, grid)
+    return AxisEvidence(sections, log, cluttered, grid, np.zeros(len(log), dtype=np.bool_))
 
 
 def _bell(shifts: Float, expected: Float, spread: Float) -> Float:

@@ -38,13 +38,13 @@ class Streak:
         return np.isfinite(self.sigma)
 
 
-def find_streak(values: Float, half_widths: Float) -> Streak | None:
-    """The streak in sections (N, len(OFFSETS)) about the axis, in units of their noise; None where they show none.
+def find_streak(values: Float, half_widths: Float, axis: Float) -> Streak | None:
+    """The streak in sections (N, len(OFFSETS)), in units of their noise; None where they show none.
 
-    half_widths (N,) of the needle there, units.
+    half_widths (N,) of the needle there, and where its axis is, (N,), units.
     """
     contrast = correlate1d(values, _line(), axis=1, mode="nearest")
-    within = np.abs(OFFSETS) < _WITHIN_SHARE * half_widths[:, None]
+    within = np.abs(OFFSETS - axis[:, None]) < _WITHIN_SHARE * half_widths[:, None]
     worth = np.where(within, np.clip(contrast, 0.0, _MOST_CONTRAST), -_MOST_CONTRAST)
     ever = np.flatnonzero(within.any(axis=0))
     if len(ever) == 0:

@@ -219,7 +219,7 @@ def run(rig: RunRig = None, config: ConfigFile = None) -> None:
     does not do what is configured, or may not be opened; 4 a daemon of the rig runs already.
     """
     from needletrack.config import load_config
-    from needletrack.daemon.logs import configure_logs
+    from needletrack.daemon.logs import logged
     from needletrack.daemon.run import Daemon, exit_code
     from needletrack.terminal import Interruption, described_skew
     from needletrack.terminal import described as described_run
@@ -227,8 +227,8 @@ def run(rig: RunRig = None, config: ConfigFile = None) -> None:
     try:
         effective = load_config(config)
         daemon = Daemon(_rig_for(rig, effective), effective)
-        configure_logs({"rig": daemon.rig.name, "run_id": daemon.context.run_id})
-        with Interruption() as interruption:
+        context = {"rig": daemon.rig.name, "run_id": daemon.context.run_id}
+        with logged(context), Interruption() as interruption:
             summary = daemon.run(interruption.stop)
     except NeedletrackError as error:
         _complain(error)

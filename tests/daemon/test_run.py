@@ -1,6 +1,7 @@
 """The daemon with cameras of the tests' own making: cameras in, messages out to an outside subscriber."""
 
 import json
+import logging
 import os
 import socket
 import subprocess
@@ -11,6 +12,7 @@ import urllib.request
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
+from io import StringIO
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -23,6 +25,7 @@ from typer.testing import CliRunner
 from needletrack.cli import app
 from needletrack.client import Received, Subscriber
 from needletrack.config import Config
+from needletrack.daemon.logs import logged
 from needletrack.daemon.process import AlreadyRunning, OnlyInstance
 from needletrack.daemon.run import Daemon, DaemonSummary, ExitCode, exit_code
 from needletrack.errors import CaptureError, ConfigError, PublishError
@@ -295,12 +298,23 @@ def test_the_command_says_what_is_wrong_in_one_line_with_its_code(tmp_path: Path
 
 def test_logs_are_json_lines_with_rig_and_run() -> None:
     code = (
-        "import logging, sys; from needletrack.daemon.logs import configure_logs;"
-        "configure_logs({'rig': 'r1', 'run_id': 'x'});"
-        "logging.getLogger('needletrack.capture.live').warning('left %s', 'gone', extra={'node': '/dev/video0'})"
+        "import logging, sys\n"
+        "from needletrack.daemon.logs import logged\n"
+        "with logged({'rig': 'r1', 'run_id': 'x'}):\n"
+        "    logging.getLogger('needletrack.capture.live').warning('left %s', 'gone', extra={'node': '/dev/video0'})\n"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     line = json.loads(done.stderr)
     assert done.stdout == ""
     assert (line["event"], line["level"], line["rig"], line["run_id"]) == ("left gone", "warning", "r1", "x")
     assert (line["node"], line["logger"]) == ("/dev/video0", "needletrack.capture.live")
+
+
+def test_logs_go_where_they_went_once_the_daemon_is_gone(caplog: pytest.LogCaptureFixture) -> None:
+    stream = StringIO()
+    with logged({"rig": "r1"}, stream):
+        logging.getLogger("needletrack.capture").warning("during")
+    logging.getLogger("needletrack.capture").warning("after")
+    assert "during" in stream.getvalue()
+    assert "after" not in stream.getvalue()
+    assert [record.message for record in caplog.records] == ["after"]

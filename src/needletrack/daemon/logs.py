@@ -2,15 +2,20 @@
 
 import logging
 import sys
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from typing import Any, TextIO
 
 import structlog
 from structlog.typing import EventDict, Processor, WrappedLogger
 
 
-def configure_logs(context: Mapping[str, Any], stream: TextIO | None = None, level: str = "INFO") -> None:
-    """Send what the package logs to `stream` (stderr), each record with time, level, logger and `context`."""
+@contextmanager
+def logged(context: Mapping[str, Any], stream: TextIO | None = None, level: str = "INFO") -> Iterator[None]:
+    """What the package logs goes to `stream` (stderr), each record with time, level, logger and `context`.
+
+    Afterwards it goes where it went before.
+    """
     stream = stream or sys.stderr
 
     def in_context(logger: WrappedLogger, method: str, event: EventDict) -> EventDict:
@@ -35,6 +40,11 @@ def configure_logs(context: Mapping[str, Any], stream: TextIO | None = None, lev
         )
     )
     logger = logging.getLogger("needletrack")
-    logger.handlers = [handler]
-    logger.propagate = False
+    before_us = logger.handlers, logger.propagate, logger.level
+    logger.handlers, logger.propagate = [handler], False
     logger.setLevel(level)
+    try:
+        yield
+    finally:
+        logger.handlers, logger.propagate = before_us[0], before_us[1]
+        logger.setLevel(before_us[2])

@@ -11,27 +11,34 @@ import urllib.request
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
+from dataclasses import replace
+from datetime import UTC, datetime, timedelta
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 from tests.capture.fake_kernel import FakeCamera, RunningKernel, two_cameras
 from tests.recording.small_recording import SIZE_PX, image_of, small_rig
 from typer.testing import CliRunner
 
+from needletrack.calibration.drift import Motion
 from needletrack.cli import app
 from needletrack.client import Received, Subscriber
 from needletrack.config import Config
 from needletrack.daemon.process import AlreadyRunning, OnlyInstance
 from needletrack.daemon.run import Daemon, DaemonSummary, ExitCode, exit_code
 from needletrack.errors import CaptureError, ConfigError, PublishError
+from needletrack.geometry.transform import RigidTransform
 from needletrack.publish.message import StatusMessage, TrackMessage
 from needletrack.recording.asl import AslRecording
 from needletrack.recording.mcap_file import McapRecording
-from needletrack.records import Clock, StampPlace
+from needletrack.recording.registration import PointPairs, registered
+from needletrack.records import Clock, StampPlace, Status
 from needletrack.replay import Replay, open_recording
-from needletrack.rig import Rig, write_rig
+from needletrack.rig import CalibrationInfo, Rig, write_rig
 
 ROOT = Path(__file__).parents[2]
 STEER = ROOT / "tests" / "data" / "recordings" / "steer-b"
@@ -45,7 +52,7 @@ def free_port() -> int:
         return int(probe.getsockname()[1])
 
 
-def config_for(rig: Rig, **tables: Any) -> Config:
+def config_for(rig: Rig, /, **tables: Any) -> Config:
     plain: dict[str, Any] = {
         "cameras": {"size_px": rig.left.size_px, "rate_hz": 50.0, "left": {"id": "usb-1"}, "right": {"id": "usb-2"}},
         "publishing": {"listen": [f"tcp/127.0.0.1:{free_port()}"], "heartbeat_s": 0.1},
@@ -194,26 +201,61 @@ def without_times(message: bytes) -> dict[str, Any]:
     return content
 
 
+def registered_before_a_camera_was_turned(rig: Rig) -> Rig:
+    """The rig as it was before the right camera was pitched by 0.1 degrees, registered to a robot."""
+    turned = Motion(turn_deg=np.array([-0.1, 0.0, 0.0])).applied_to(rig)
+    before = replace(rig, right_from_left=turned.right_from_left)
+    seen_mm = np.array([[-40.0, -30, 220], [45, -25, 230], [-35, 35, 240], [40, 30, 225], [0, 0, 290]])
+    robot_from_rig = RigidTransform(
+        Rotation.from_euler("zyx", [80, -20, 130], degrees=True).as_matrix(), np.array([412.0, -80, 950])
+    )
+    pairs = PointPairs(seen_mm, robot_from_rig.apply(seen_mm), None)
+    return registered(before, pairs, "robot_base", datetime.now(UTC))[0]
+
+
+def test_an_old_calibration_is_said_at_the_start_and_in_every_heartbeat(caplog: pytest.LogCaptureFixture) -> None:
+    info = CalibrationInfo(calibrated_at=datetime.now(UTC) - timedelta(days=45))
+    rig = replace(small_rig(), calibration=info)
+    for max_age_days, is_old in ((30.0, True), (60.0, False)):
+        caplog.clear()
+        config = config_for(rig, rig={"max_age_days": max_age_days})
+        with running(rig, config, RunningKernel(two_cameras(SIZE_PX), noise)) as daemon:
+            status = daemon.status(lambda status: status.calibration.age_days is not None)
+            daemon.stop()
+        said = [record for record in caplog.records if "calibrated 45 days ago, more than 30" in record.getMessage()]
+        assert [record.levelname for record in said] == ["WARNING"] * is_old
+        assert status.calibration.warning == (said[0].getMessage() if is_old else None)
+
+
 def test_recorded_live_and_replayed_give_the_same_bytes(tmp_path: Path) -> None:
     recorded = AslRecording(STEER)
-    rig, cameras = recorded.rig, two_cameras(recorded.rig.left.size_px)
+    rig = registered_before_a_camera_was_turned(recorded.rig)
+    cameras, count = two_cameras(rig.left.size_px), 9
     daemons: list[Daemon] = []
 
     def one_at_a_time(number: int) -> tuple[bytes, bytes] | None:
         # A pair comes when the one before it is done, so that none is overwritten.
         service = daemons[0].service if daemons else None
-        if number == 5 or service is None or sum(service.statuses.values()) < number or service.busy_s:
+        if number == count or service is None or sum(service.statuses.values()) < number or service.busy_s:
             return None
         pair = recorded.read(number)
         return pair.left.image.tobytes(), pair.right.image.tobytes()
 
-    config = config_for(rig, recording={"folder": tmp_path})
+    # Sooner than by default, which takes more pairs than are played here.
+    config = config_for(rig, recording={"folder": tmp_path}, drift={"least_pairs": 5})
     with running(rig, config, RunningKernel(cameras, one_at_a_time)) as daemon:
         daemons.append(daemon.daemon)
-        live = [daemon.next().message for _ in range(5)]
+        live = [daemon.next().message for _ in range(count)]
         summary = daemon.stop()
     assert summary.run.dropped == {}
     assert any(message.centerline_mm for message in live)
+    assert {message.frame_id for message in live} == {"robot_base"}
+    in_robot_mm = np.array([message.tip.position_mm for message in live if message.tip is not None])
+    # Where the left camera stands in the robot's frame, and how far it sees.
+    away_mm = np.linalg.norm(in_robot_mm - (412, -80, 950), axis=1)
+    assert ((away_mm > 150) & (away_mm < 350)).all()
+    assert "calibration_drift" not in live[3].reasons
+    assert (live[-1].status, "calibration_drift" in live[-1].reasons) == (Status.DEGRADED, True)
     (file,) = tmp_path.glob("*.mcap")
     published = [told for _, told in McapRecording(file).tracks()]
     assert published == [message.to_json() for message in live]

@@ -6,6 +6,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass
+from datetime import UTC, datetime
 from enum import IntEnum
 
 import numpy as np
@@ -85,7 +86,7 @@ class Daemon:
     def __init__(self, rig: Rig, config: Config, *, kernel: Kernel | None = None) -> None:
         require_fit(rig, config)
         self.rig, self.config = rig, config
-        self.context = RunContext(rig.name, Source.LIVE, config.digest, rig.digest)
+        self.context = RunContext(rig.name, Source.LIVE, config.digest, rig.digest, frame_id=rig.frame_id)
         self._cameras = LiveSource(
             config.cameras,
             tolerance_us=config.pairing.tolerance_us,
@@ -117,6 +118,8 @@ class Daemon:
                 rig,
                 self.context,
                 heartbeat_s=config.publishing.heartbeat_s,
+                drift=config.drift,
+                max_age_days=config.rig.max_age_days,
                 surroundings=self.surroundings,
                 in_threads=self._in_thread,
             )
@@ -129,6 +132,8 @@ class Daemon:
             opened.enter_context(_Pulse(notifier, service, self._cameras))
             notifier.ready("waiting for both cameras")
             ready()
+            if warning := rig.age_warning(config.rig.max_age_days, datetime.now(UTC)):
+                _log.warning("%s", warning)
             _log.info("the daemon runs", extra={"rig_digest": rig.digest, "config_digest": config.digest})
             sinks: list[Sink] = [_Published(publisher), metrics]
             if self._recorder is not None:

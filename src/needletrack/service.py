@@ -216,28 +216,7 @@ class Service:
             yield Arrival(pair, dict(self._source.dropped))
 
     def _newest_pairs(self, stop: threading.Event) -> Iterator[Arrival]:
-        capture = threading.Thread(target=self._capture, args=(stop,), name="needletrack-capture")
-        capture.start()
-        try:
-            while (arrival := self._slot.take()) is not None:
-                yield arrival
-        finally:
-            # Also where a sink raised: the capture thread must not outlive the run.
-            stop.set()
-            capture.join()
-        if self._slot.failure is not None:
-            raise self._slot.failure
-
-    def _capture(self, stop: threading.Event) -> None:
-        failure: BaseException | None = None
-        try:
-            self._in_threads("capture")
-            for pair in self._source.pairs(stop):
-                self._slot.put(Arrival(pair, dict(self._source.dropped)))
-        except BaseException as error:  # raised again by the worker
-            failure = error
-        finally:
-            self._slot.close(failure)
+        return newest_pairs(self._source, self._slot, stop, lambda: self._in_threads("capture"))
 
 
 class LatestSlot:
@@ -271,6 +250,38 @@ class LatestSlot:
         with self._changed:
             self._closed, self.failure = True, failure
             self._changed.notify()
+
+
+def newest_pairs(
+    source: FrameSource, slot: LatestSlot, stop: threading.Event, in_thread: Callable[[], None] = lambda: None
+) -> Iterator[Arrival]:
+    """The newest pair each time one is asked for; a thread of its own, which calls in_thread first, keeps taking them.
+
+    Sets `stop` on every way out, and waits for the thread; raises what the source raised.
+    """
+
+    def capture() -> None:
+        failure: BaseException | None = None
+        try:
+            in_thread()
+            for pair in source.pairs(stop):
+                slot.put(Arrival(pair, dict(source.dropped)))
+        except BaseException as error:  # raised again by whoever takes
+            failure = error
+        finally:
+            slot.close(failure)
+
+    thread = threading.Thread(target=capture, name="needletrack-capture")
+    thread.start()
+    try:
+        while (arrival := slot.take()) is not None:
+            yield arrival
+    finally:
+        # Also where the taker raised: the thread must not outlive the run.
+        stop.set()
+        thread.join()
+    if slot.failure is not None:
+        raise slot.failure
 
 
 def _before_tracking_ms(pair: StereoPair, began_ns: int) -> dict[str, float]:

@@ -18,6 +18,7 @@ from needletrack.capture.source import FrameSource
 from needletrack.config import Config
 from needletrack.daemon.metrics import Metrics
 from needletrack.daemon.process import AlreadyRunning, OnlyInstance, lock_memory, schedule_thread, settle_memory
+from needletrack.daemon.record import both_cameras
 from needletrack.daemon.systemd import Notifier
 from needletrack.errors import CaptureError, ConfigError
 from needletrack.publish.message import RunContext, Source, TrackMessage, WireCamera, WireRecording, WireSkew
@@ -87,12 +88,7 @@ class Daemon:
         require_fit(rig, config)
         self.rig, self.config = rig, config
         self.context = RunContext(rig.name, Source.LIVE, config.digest, rig.digest, frame_id=rig.frame_id)
-        self._cameras = LiveSource(
-            config.cameras,
-            tolerance_us=config.pairing.tolerance_us,
-            offset_us=config.pairing.offset_us,
-            kernel=kernel,
-        )
+        self._cameras = both_cameras(config, kernel)
         self._recorder: Recorder | None = None
         self.service: Service | None = None
 

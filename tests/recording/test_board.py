@@ -59,6 +59,16 @@ def as_bag(folder: Path, output: Path) -> Path:
 
 
 @pytest.mark.parametrize("stored", [as_file, as_bag])
+def test_every_kind_of_recording_shows_the_same_pictures(stored: Callable[[Path, Path], Path], tmp_path: Path) -> None:
+    pictures, known = open_board_pictures(stored(BOARD, tmp_path / "bench.mcap")), open_board_pictures(BOARD)
+    assert (pictures.size_px, len(pictures.names)) == (known.size_px, len(known.names))
+    for index in range(len(known.names)):
+        for ours, theirs in zip(pictures.read(index), known.read(index), strict=True):
+            assert np.array_equal(ours, theirs)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("stored", [as_file, as_bag])
 def test_every_kind_of_recording_gives_the_same_rig(stored: Callable[[Path, Path], Path], tmp_path: Path) -> None:
     path, output = stored(BOARD, tmp_path / "bench.mcap"), tmp_path / "rig.yaml"
     given = ["--square-mm", "2"]

@@ -93,8 +93,9 @@ def test_a_replayed_recording_of_stills_is_told_to_hold_still(tmp_path: Path) ->
     assert {guidance.said.split(":")[0] for guidance in said} == {"moving"}
 
 
-def test_a_recording_is_never_overwritten(tmp_path: Path) -> None:
+def test_a_recording_is_never_overwritten_but_an_empty_one_is_gone_on_with(tmp_path: Path) -> None:
     BoardRecorder(tmp_path / "new")
+    BoardRecorder(tmp_path / "new").write(next(Drawn([(30, 0)]).pairs(Event())))
     with pytest.raises(RecordingError, match="name a new folder"):
         BoardRecorder(tmp_path / "new")
 

@@ -29,9 +29,12 @@ def endpoint() -> str:
 
 
 @contextmanager
-def daemon(endpoint: str) -> Iterator[ZenohPublisher]:
+def daemon(endpoint: str, warning: str | None = None) -> Iterator[ZenohPublisher]:
+    example = example_messages()[1]
+
     def status() -> StatusMessage:
-        return example_messages()[1]
+        calibration = example.calibration.model_copy(update={"warning": warning})
+        return example.model_copy(update={"calibration": calibration})
 
     with ZenohPublisher(example_run(), status, listen=[endpoint]) as publisher:
         yield publisher
@@ -126,7 +129,7 @@ def test_reasons_are_shown(endpoint: str) -> None:
 def test_on_a_terminal_there_is_a_panel(endpoint: str) -> None:
     console = screen()
     with watching(endpoint, console, until_gone=True) as summary:
-        with daemon(endpoint) as publisher:
+        with daemon(endpoint, "calibrated 28 days ago, more than 20") as publisher:
             assert publisher.wait_for_subscriber(WAIT_S)
             for number in (0, 2):
                 publisher.publish(message(number, dropped=number // 2))
@@ -138,7 +141,7 @@ def test_on_a_terminal_there_is_a_panel(endpoint: str) -> None:
         "2 tracks   2 ok",
         "1 dropped (daemon's count: overwritten 1)   0 lost on the way",
         "gone",
-        "live running   60.0 pairs/s   calibrated 28 days ago",
+        "live running   60.0 pairs/s   calibrated 28 days ago: too long",
         endpoint,
     ):
         assert words in last

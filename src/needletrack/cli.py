@@ -37,6 +37,8 @@ for _variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "OPENCV_FOR_THREADS
 
 LAB_RECORDING = Path("tests/data/recordings/lab-a")
 _TABLE_WIDTH = 160
+# Of a film; one pair would do.
+_CHECK_MOST = 12
 _TERMS: "dict[str, Terms]" = {"4": 4, "5": 5, "8": 8}
 
 app = typer.Typer(
@@ -475,7 +477,9 @@ def calibrate(
     folder: Annotated[
         Path,
         typer.Argument(
-            metavar="FOLDER", help="Recording of the board, or the left camera's pictures; ten views or more."
+            metavar="FOLDER",
+            help="Recording of the board (folder, file of `record`, ROS bag), or the left camera's pictures; ten views "
+            "or more.",
         ),
     ],
     right: Annotated[
@@ -501,37 +505,43 @@ def calibrate(
         Path | None,
         typer.Option(
             metavar="RECORDING",
-            help="With guidance: take the views that add something from a stream into FOLDER, a new one, then "
-            "calibrate. The stream is a recording, played at its own pace.",
+            help="As --live, from a recording, played at its own pace.",
         ),
     ] = None,
+    live: Annotated[
+        bool,
+        typer.Option(
+            "--live",
+            help="Take the views that add something from the configuration's cameras into FOLDER, a new one, with "
+            "guidance, then calibrate. Ctrl-C ends it sooner.",
+        ),
+    ] = False,
+    most: Annotated[
+        int, typer.Option(min=4, help="Of a film, such as `record` makes: look at so many pairs, the stillest ones.")
+    ] = 60,
 ) -> None:
     """Make a rig file from pictures of a checkerboard or a ChArUco board, and a report of what it is worth."""
     from needletrack.config import load_config
     from needletrack.recording.board import calibrate_from_pictures, open_board_pictures
     from needletrack.report.calibration import write_calibration_report
     from needletrack.rig import write_rig
-    from needletrack.terminal import Interruption, steps_shown
+    from needletrack.terminal import steps_shown
 
     board = _board(squares, square_mm, marker_mm, dictionary, legacy=legacy)
-    workspace = load_config(config).tracking.workspace
+    settings = load_config(config)
     console = Console(stderr=True)
-    if stream is not None:
-        from needletrack.guidance import GuidanceShown, collect
-        from needletrack.recording.board import BoardRecorder, board_stream
-
-        with Interruption() as interruption, GuidanceShown(console) as shown:
-            collect(board_stream(stream), board, BoardRecorder(folder), interruption.stop, shown.take)
-    pictures = open_board_pictures(folder, right)
+    if live or stream is not None:
+        _collect(folder, right, board, settings, console, stream=stream, live=live)
+    pictures = open_board_pictures(folder, right, most=most, tolerance_us=_tolerance_us(settings))
     with steps_shown(console, "looking for the board", len(pictures.names)) as progress:
         found = calibrate_from_pictures(
             pictures,
             board,
-            name or _rig_name(folder),
+            name or _rig_name(folder.with_suffix("") if folder.is_file() else folder),
             datetime.now(UTC),
             lens=None if lens == "auto" else _TERMS[lens],
             warp=warp,
-            workspace=workspace,
+            workspace=settings.tracking.workspace,
             progress=progress,
         )
     write_rig(found.rig, output)
@@ -561,6 +571,10 @@ def check(
     dictionary: Annotated[str, typer.Option(help="Dictionary of its markers.")] = "DICT_5X5_1000",
     legacy: Annotated[bool, typer.Option("--legacy", help="ChArUco board as OpenCV drew it before 4.6.")] = False,
     config: ConfigFile = None,
+    live: Annotated[
+        bool, typer.Option("--live", help="Take the views from the configuration's cameras into FOLDER, a new one.")
+    ] = False,
+    views: Annotated[int, typer.Option(min=1, help="So many views, live.")] = 3,
 ) -> None:
     """Check with a fresh picture pair of a board whether the cameras still stand as they were calibrated.
 
@@ -574,7 +588,13 @@ def check(
     board = _board(squares, square_mm, marker_mm, dictionary, legacy=legacy)
     if warning := checked.age_warning(settings.rig.max_age_days, datetime.now(UTC)):
         typer.echo(f"warning: {warning}", err=True)
-    found = check_pictures(checked, open_board_pictures(folder, right), board, settings.tracking.workspace)
+    if live:
+        from needletrack.daemon.run import require_fit
+
+        require_fit(checked, settings)
+        _collect(folder, right, board, settings, Console(stderr=True), live=True, enough=views)
+    pictures = open_board_pictures(folder, right, most=_CHECK_MOST, tolerance_us=_tolerance_us(settings))
+    found = check_pictures(checked, pictures, board, settings.tracking.workspace)
     for line in found.told():
         typer.echo(line)
     if found.check.moved:
@@ -650,6 +670,41 @@ def _board(squares: str, square_mm: float, marker_mm: float | None, dictionary: 
     if marker_mm is None:
         return Checkerboard(across, down, square_mm)
     return CharucoBoard(across, down, square_mm, marker_mm, dictionary, legacy)
+
+
+def _collect(
+    folder: Path,
+    right: Path | None,
+    board: "Board",
+    settings: "Config",
+    console: Console,
+    *,
+    stream: Path | None = None,
+    live: bool,
+    enough: int | None = None,
+) -> None:
+    """Views with guidance into the folder; raises CalibrationError where none was taken."""
+    from needletrack.daemon.board import collect_live
+    from needletrack.guidance import GuidanceShown, collect
+    from needletrack.recording.board import BoardRecorder, board_stream
+    from needletrack.terminal import Interruption, warnings_shown
+
+    if right is not None or (live and stream is not None):
+        raise CalibrationError("--live and --stream take the views themselves: give one of them, and one new folder")
+    with Interruption() as interruption, GuidanceShown(console) as shown, warnings_shown(console):
+        if stream is None:
+            last = collect_live(settings, board, folder, interruption.stop, shown.take, enough=enough)
+        else:
+            last = collect(board_stream(stream), board, BoardRecorder(folder), interruption.stop, shown.take)
+    if last is None or not last.accepted:
+        said = "no pair came" if last is None else f"of the last pair: {last.said}"
+        raise CalibrationError(f"no view of the board was taken ({said})")
+    typer.echo(f"{folder}: {last.accepted} views taken", err=True)
+
+
+def _tolerance_us(settings: "Config") -> float:
+    """Of pairs that were taken with these settings, whose right stamps may be later by a constant."""
+    return settings.pairing.tolerance_us + abs(settings.pairing.offset_us)
 
 
 def _rig_name(folder: Path) -> str:

@@ -9,6 +9,7 @@ import time
 from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass
+from datetime import UTC, datetime
 from enum import StrEnum
 from pathlib import Path
 
@@ -26,7 +27,6 @@ from needletrack.publish.session import open_session
 from needletrack.records import Clock, Image, StereoPair
 from needletrack.rig import Rig
 
-_OLD_CALIBRATION_DAYS = 30
 _SATURATED, _MOST_SATURATED = 250, 0.01
 _DARK, _SAME_RATE, _MOST_LOST = 20, 0.02, 0.01
 _DISK_TEST_MB, _COMPRESSED_TO, _DISK_RESERVE = 128, 0.65, 1.5
@@ -86,10 +86,13 @@ def _rig(config: Config, rig: Callable[[], Rig]) -> Generator[Finding, None, Rig
     if info.calibrated_at is None:
         yield Finding("rig", Verdict.WARN, f"{known.name}{rms}: nobody says when it was calibrated", "calibrate anew")
         return known
-    age_days = (time.time() - info.calibrated_at.timestamp()) / 86_400
-    old = age_days > _OLD_CALIBRATION_DAYS
-    verdict, remedy = (Verdict.WARN, "calibrate anew, or check it against a board") if old else (Verdict.PASS, "")
-    yield Finding("rig", verdict, f"{known.name}{rms}, calibrated {age_days:.0f} days ago", remedy)
+    now = datetime.now(UTC)
+    age = f"calibrated {(now - info.calibrated_at).days} days ago"
+    if known.age_warning(config.rig.max_age_days, now) is None:
+        yield Finding("rig", Verdict.PASS, f"{known.name}{rms}, {age}")
+    else:
+        age += f", more than {config.rig.max_age_days:g} (rig.max_age_days)"
+        yield Finding("rig", Verdict.WARN, f"{known.name}{rms}, {age}", "needletrack check, or calibrate anew")
     return known
 
 

@@ -31,18 +31,33 @@ _SHARP_PX = 1.5
 class Guidance:
     """What a person holding the board needs to know: the last pair's fate, and what is missing.
 
-    accepted: of the views so far; sequence: of the last pair.
+    accepted: of the views so far; sequence: of the last pair; enough: so many views do, wherever the board is (None:
+    all that a calibration needs).
     """
 
     sequence: int
     accepted: int
     said: str
     covered: Coverage
+    enough: int | None = None
+
+    @property
+    def missing(self) -> tuple[str, ...]:
+        """What to show next, the most useful first; empty where nothing is missing."""
+        if self.enough is None:
+            return self.covered.missing
+        more = self.enough - self.accepted
+        return (f"hold the board still at {more} more place{'s' if more > 1 else ''}",) if more > 0 else ()
+
+    @property
+    def share(self) -> float:
+        """How much of what is wanted is there, 0 to 1."""
+        return self.covered.share if self.enough is None else min(1.0, self.accepted / self.enough)
 
     @property
     def done(self) -> bool:
         """Whether nothing is missing any more."""
-        return not self.covered.missing
+        return not self.missing
 
 
 def collect(
@@ -51,10 +66,13 @@ def collect(
     recorder: BoardRecorder,
     stop: Event,
     told: Callable[[Guidance], None] = lambda guidance: None,
+    *,
+    enough: int | None = None,
 ) -> Guidance | None:
     """Record the views that add something until nothing is missing, the source ends or `stop` is set.
 
-    Returns the last guidance; None where no pair came. Raises as the source and the recorder do.
+    enough: end after so many views; without it, once they cover what a calibration needs. Returns the last guidance;
+    None where no pair came. Raises as the source and the recorder do.
     """
     views: list[BoardView] = []
     before: BoardView | None = None
@@ -68,7 +86,7 @@ def collect(
         before = view
         height, width = pair.left.image.shape
         covered = coverage(views, board, (width, height))
-        guidance = Guidance(pair.sequence, len(views), refusal or "taken", covered)
+        guidance = Guidance(pair.sequence, len(views), refusal or "taken", covered, enough)
         told(guidance)
         if guidance.done or stop.is_set():
             break
@@ -95,14 +113,15 @@ def drawn(guidance: Guidance) -> RenderableType:
     grids = Table.grid(padding=(0, 3))
     grids.add_row(*(_ninths(covered.corners[side]) for side in (0, 1)), _tilts(covered))
     grids.add_row(Text("left view", style="dim"), Text("right view", style="dim"), Text("tilts", style="dim"))
-    wanted = covered.missing
+    wanted = guidance.missing
     next_up = Text(f"next: {wanted[0]}" if wanted else "nothing is missing", style="bold")
     more = [Text(f"also: {sentence}", style="dim") for sentence in wanted[1:4]]
-    bar = Text("█" * round(30 * covered.share), style="green") + Text("░" * (30 - round(30 * covered.share)))
-    head = Text(f"{guidance.accepted} of {WANTED_VIEWS} views  ") + bar
+    filled = round(30 * guidance.share)
+    bar = Text("█" * filled, style="green") + Text("░" * (30 - filled))
+    head = Text(f"{guidance.accepted} of {guidance.enough or WANTED_VIEWS} views  ") + bar
     return Panel(
         Group(head, Text(f"pair {guidance.sequence}: {guidance.said}"), Text(""), grids, Text(""), next_up, *more),
-        title="calibration",
+        title="calibration" if guidance.enough is None else "check",
         width=96,
     )
 
@@ -128,7 +147,7 @@ def _tilts(covered: Coverage) -> Text:
 
 def plain(guidance: Guidance) -> str:
     """The same on one line, where there is no terminal."""
-    wanted = guidance.covered.missing
+    wanted = guidance.missing
     return f"pair {guidance.sequence}: {guidance.said}; {guidance.accepted} views; " + (
         f"next: {wanted[0]}" if wanted else "nothing is missing"
     )

@@ -68,6 +68,7 @@ class Replay:
             independent=independent,
             heartbeat_s=config.publishing.heartbeat_s,
             drift=config.drift,
+            max_age_days=config.rig.max_age_days,
         )
 
     def warm_up(self) -> None:

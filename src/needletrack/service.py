@@ -88,8 +88,9 @@ class Service:
     """Runs one source through one tracker into sinks.
 
     independent: every pair starts without memory. every_frame: no pair is skipped however slow tracking is; otherwise
-    the newest pair wins and the one it overwrites is counted. surroundings is asked once a heartbeat; in_threads is
-    called in each of the two threads as it begins, with its name. The counters may be read from any thread.
+    the newest pair wins and the one it overwrites is counted. max_age_days: heartbeats warn of an older calibration,
+    None: never. surroundings is asked once a heartbeat; in_threads is called in each of the two threads as it begins,
+    with its name. The counters may be read from any thread.
     """
 
     def __init__(
@@ -103,12 +104,13 @@ class Service:
         independent: bool = False,
         heartbeat_s: float = 0.5,
         drift: DriftParameters | None = None,
+        max_age_days: float | None = None,
         surroundings: Callable[[], Surroundings] = Surroundings,
         in_threads: Callable[[str], None] = lambda name: None,
     ) -> None:
         self._source, self._tracker, self._rig, self._run = source, tracker, rig, run
         self._every_frame, self._independent, self._heartbeat_s = every_frame, independent, heartbeat_s
-        self._drift = drift or DriftParameters()
+        self._drift, self._max_age_days = drift or DriftParameters(), max_age_days
         self._surroundings, self._in_threads = surroundings, in_threads
         self._slot = LatestSlot()
         self._state = ServiceState.STARTING
@@ -199,7 +201,7 @@ class Service:
             published_at_ns=time.time_ns(),
             uptime_s=now_s - self._started_s,
             last_sequence=self._last_sequence,
-            calibration=_calibration(self._rig),
+            calibration=_calibration(self._rig, self._max_age_days),
             rates=rates,
             dropped=self.dropped,
             counters={f"tracks_{status.value}": done[status] for status in Status},
@@ -214,28 +216,7 @@ class Service:
             yield Arrival(pair, dict(self._source.dropped))
 
     def _newest_pairs(self, stop: threading.Event) -> Iterator[Arrival]:
-        capture = threading.Thread(target=self._capture, args=(stop,), name="needletrack-capture")
-        capture.start()
-        try:
-            while (arrival := self._slot.take()) is not None:
-                yield arrival
-        finally:
-            # Also where a sink raised: the capture thread must not outlive the run.
-            stop.set()
-            capture.join()
-        if self._slot.failure is not None:
-            raise self._slot.failure
-
-    def _capture(self, stop: threading.Event) -> None:
-        failure: BaseException | None = None
-        try:
-            self._in_threads("capture")
-            for pair in self._source.pairs(stop):
-                self._slot.put(Arrival(pair, dict(self._source.dropped)))
-        except BaseException as error:  # raised again by the worker
-            failure = error
-        finally:
-            self._slot.close(failure)
+        return newest_pairs(self._source, self._slot, stop, lambda: self._in_threads("capture"))
 
 
 class LatestSlot:
@@ -271,6 +252,38 @@ class LatestSlot:
             self._changed.notify()
 
 
+def newest_pairs(
+    source: FrameSource, slot: LatestSlot, stop: threading.Event, in_thread: Callable[[], None] = lambda: None
+) -> Iterator[Arrival]:
+    """The newest pair each time one is asked for; a thread of its own, which calls in_thread first, keeps taking them.
+
+    Sets `stop` on every way out, and waits for the thread; raises what the source raised.
+    """
+
+    def capture() -> None:
+        failure: BaseException | None = None
+        try:
+            in_thread()
+            for pair in source.pairs(stop):
+                slot.put(Arrival(pair, dict(source.dropped)))
+        except BaseException as error:  # raised again by whoever takes
+            failure = error
+        finally:
+            slot.close(failure)
+
+    thread = threading.Thread(target=capture, name="needletrack-capture")
+    thread.start()
+    try:
+        while (arrival := slot.take()) is not None:
+            yield arrival
+    finally:
+        # Also where the taker raised: the thread must not outlive the run.
+        stop.set()
+        thread.join()
+    if slot.failure is not None:
+        raise slot.failure
+
+
 def _before_tracking_ms(pair: StereoPair, began_ns: int) -> dict[str, float]:
     """The parts of the latency before tracking: from the stamp to the complete pair here, and its wait for the worker.
 
@@ -286,11 +299,12 @@ def _before_tracking_ms(pair: StereoPair, began_ns: int) -> dict[str, float]:
     return parts_ms
 
 
-def _calibration(rig: Rig) -> WireCalibration:
-    calibrated_at = rig.calibration.calibrated_at
-    age_days = None if calibrated_at is None else (datetime.now(UTC) - calibrated_at).total_seconds() / 86_400
+def _calibration(rig: Rig, max_age_days: float | None) -> WireCalibration:
+    calibrated_at, now = rig.calibration.calibrated_at, datetime.now(UTC)
+    age_days = rig.age_days(now)
     return WireCalibration(
         calibrated_at=None if calibrated_at is None else calibrated_at.isoformat(),
         age_days=None if age_days is None else round(age_days, 2),
         reprojection_rms_px=rig.calibration.reprojection_rms_px,
+        warning=None if max_age_days is None else rig.age_warning(max_age_days, now),
     )

@@ -20,7 +20,8 @@ from scipy.spatial import cKDTree
 
 from needletrack.errors import NeedleNotFound, RecordingError
 from needletrack.geometry.spline import arc_length, resample
-from needletrack.recording.asl import AslRecording
+from needletrack.recording.replay import StoredRecording
+from needletrack.recording.stored import open_stored
 from needletrack.records import Float, Int, NeedleTrack, StereoPair
 from needletrack.rig import Rig
 from needletrack.tracking.parameters import TrackingParameters
@@ -154,7 +155,7 @@ def table1(folder: Path | str, repeats: int = 9, parameters: TrackingParameters 
     """
     if repeats < 1:
         raise ValueError(f"{repeats} runs have no median")
-    recording = AslRecording(folder)
+    recording = open_stored(Path(folder))
     truth = _read_truth(recording.folder)
     pairs, results = _usable(recording)
     best = min(range(len(pairs)), key=lambda i: abs(len(results[i].left.skeleton_px) - PAPER[1][0]))
@@ -179,7 +180,7 @@ def table1(folder: Path | str, repeats: int = 9, parameters: TrackingParameters 
     )
 
 
-def _usable(recording: AslRecording) -> tuple[list[StereoPair], list[ReferenceResult]]:
+def _usable(recording: StoredRecording) -> tuple[list[StereoPair], list[ReferenceResult]]:
     pairs, results = [], []
     for index in range(len(recording)):
         pair = recording.read(index)

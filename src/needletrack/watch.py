@@ -262,6 +262,7 @@ def _tip(received: Received) -> str:
 def _daemon(status: StatusMessage) -> str:
     age = status.calibration.age_days
     calibration = "" if age is None else f"   calibrated {age:.0f} days ago"
+    calibration += "" if status.calibration.warning is None else ": too long"
     error = "" if status.last_error is None else f"   {status.last_error}"
     rate = f"{status.rates.pairs_per_s:.1f} pairs/s"
     return f"{status.source.value} {status.state.value}   {rate}{calibration}{error}"

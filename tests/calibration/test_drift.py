@@ -110,6 +110,7 @@ def test_a_rig_without_a_stated_uncertainty_is_checked_too() -> None:
     assert check_views(rig, None, None, views_of(moved, 2, 3), BOARD, workspace_mm(rig)).moved
 
 
+@pytest.mark.slow
 def test_real_pictures_of_a_rig_that_stood_still_and_of_one_that_did_not() -> None:
     folder = RECORDINGS / "calib-a"
     files = [sorted((folder / f"cam{camera}" / "data").glob("*.png")) for camera in (0, 1)]

@@ -132,7 +132,7 @@ def noise_floor_mm(
     return float(np.sqrt(np.mean(np.square(errors_mm))))
 
 
-@pytest.mark.parametrize("recording", ["large_board", "paper_board"])
+@pytest.mark.parametrize("recording", [pytest.param("large_board", marks=pytest.mark.slow), "paper_board"])
 def test_real_pictures_give_the_rig_as_well_as_their_noise_allows(
     recording: str, request: pytest.FixtureRequest
 ) -> None:

@@ -12,16 +12,21 @@ import urllib.request
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
+from dataclasses import replace
+from datetime import UTC, datetime, timedelta
 from io import StringIO
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 from tests.capture.fake_kernel import FakeCamera, RunningKernel, two_cameras
 from tests.recording.small_recording import SIZE_PX, image_of, small_rig
 from typer.testing import CliRunner
 
+from needletrack.calibration.drift import Motion
 from needletrack.cli import app
 from needletrack.client import Received, Subscriber
 from needletrack.config import Config
@@ -29,12 +34,14 @@ from needletrack.daemon.logs import logged
 from needletrack.daemon.process import AlreadyRunning, OnlyInstance
 from needletrack.daemon.run import Daemon, DaemonSummary, ExitCode, exit_code
 from needletrack.errors import CaptureError, ConfigError, PublishError
+from needletrack.geometry.transform import RigidTransform
 from needletrack.publish.message import StatusMessage, TrackMessage
 from needletrack.recording.asl import AslRecording
 from needletrack.recording.mcap_file import McapRecording
-from needletrack.records import Clock, StampPlace
+from needletrack.recording.registration import PointPairs, registered
+from needletrack.records import Clock, StampPlace, Status
 from needletrack.replay import Replay, open_recording
-from needletrack.rig import Rig, write_rig
+from needletrack.rig import CalibrationInfo, Rig, write_rig
 
 ROOT = Path(__file__).parents[2]
 STEER = ROOT / "tests" / "data" / "recordings" / "steer-b"
@@ -48,7 +55,7 @@ def free_port() -> int:
         return int(probe.getsockname()[1])
 
 
-def config_for(rig: Rig, **tables: Any) -> Config:
+def config_for(rig: Rig, /, **tables: Any) -> Config:
     plain: dict[str, Any] = {
         "cameras": {"size_px": rig.left.size_px, "rate_hz": 50.0, "left": {"id": "usb-1"}, "right": {"id": "usb-2"}},
         "publishing": {"listen": [f"tcp/127.0.0.1:{free_port()}"], "heartbeat_s": 0.1},
@@ -197,34 +204,81 @@ def without_times(message: bytes) -> dict[str, Any]:
     return content
 
 
-def test_recorded_live_and_replayed_give_the_same_bytes(tmp_path: Path) -> None:
-    recorded = AslRecording(STEER)
-    rig, cameras = recorded.rig, two_cameras(recorded.rig.left.size_px)
+def registered_before_a_camera_was_turned(rig: Rig) -> Rig:
+    """The rig as it was before the right camera was pitched by 0.1 degrees, registered to a robot."""
+    turned = Motion(turn_deg=np.array([-0.1, 0.0, 0.0])).applied_to(rig)
+    before = replace(rig, right_from_left=turned.right_from_left)
+    seen_mm = np.array([[-40.0, -30, 220], [45, -25, 230], [-35, 35, 240], [40, 30, 225], [0, 0, 290]])
+    robot_from_rig = RigidTransform(
+        Rotation.from_euler("zyx", [80, -20, 130], degrees=True).as_matrix(), np.array([412.0, -80, 950])
+    )
+    pairs = PointPairs(seen_mm, robot_from_rig.apply(seen_mm), None)
+    return registered(before, pairs, "robot_base", datetime.now(UTC))[0]
+
+
+def test_an_old_calibration_is_said_at_the_start_and_in_every_heartbeat(caplog: pytest.LogCaptureFixture) -> None:
+    info = CalibrationInfo(calibrated_at=datetime.now(UTC) - timedelta(days=45))
+    rig = replace(small_rig(), calibration=info)
+    for max_age_days, is_old in ((30.0, True), (60.0, False)):
+        caplog.clear()
+        config = config_for(rig, rig={"max_age_days": max_age_days})
+        with running(rig, config, RunningKernel(two_cameras(SIZE_PX), noise)) as daemon:
+            status = daemon.status(lambda status: status.calibration.age_days is not None)
+            daemon.stop()
+        said = [record for record in caplog.records if "calibrated 45 days ago, more than 30" in record.getMessage()]
+        assert [record.levelname for record in said] == ["WARNING"] * is_old
+        assert status.calibration.warning == (said[0].getMessage() if is_old else None)
+
+
+def live_and_replayed(folder: Path, rig: Rig, count: int) -> list[TrackMessage]:
+    """So many pairs of steer-b tracked live, one after another; asserts that their replay gives the same bytes."""
+    recorded, cameras = AslRecording(STEER), two_cameras(rig.left.size_px)
     daemons: list[Daemon] = []
 
     def one_at_a_time(number: int) -> tuple[bytes, bytes] | None:
         # A pair comes when the one before it is done, so that none is overwritten.
         service = daemons[0].service if daemons else None
-        if number == 5 or service is None or sum(service.statuses.values()) < number or service.busy_s:
+        if number == count or service is None or sum(service.statuses.values()) < number or service.busy_s:
             return None
         pair = recorded.read(number)
         return pair.left.image.tobytes(), pair.right.image.tobytes()
 
-    config = config_for(rig, recording={"folder": tmp_path})
+    # Sooner than by default, which takes more pairs than are played here.
+    config = config_for(rig, recording={"folder": folder}, drift={"least_pairs": 5})
     with running(rig, config, RunningKernel(cameras, one_at_a_time)) as daemon:
+        # Whoever hears heartbeats is connected, and will miss no track.
+        daemon.status(lambda status: status.cameras is not None)
         daemons.append(daemon.daemon)
-        live = [daemon.next().message for _ in range(5)]
+        live = [daemon.next().message for _ in range(count)]
         summary = daemon.stop()
     assert summary.run.dropped == {}
-    assert any(message.centerline_mm for message in live)
-    (file,) = tmp_path.glob("*.mcap")
+    (file,) = folder.glob("*.mcap")
     published = [told for _, told in McapRecording(file).tracks()]
     assert published == [message.to_json() for message in live]
-    output = tmp_path / "replayed.jsonl"
+    output = folder / "replayed.jsonl"
     Replay(open_recording(file, config), config).run(threading.Event(), output=output)
     replayed = output.read_bytes().splitlines()
     for ours, again in zip(published, replayed, strict=True):
         assert json.dumps(without_times(ours)).encode() == json.dumps(without_times(again)).encode()
+    return live
+
+
+def test_recorded_live_and_replayed_give_the_same_bytes_in_the_robot_s_frame(tmp_path: Path) -> None:
+    live = live_and_replayed(tmp_path, registered_before_a_camera_was_turned(AslRecording(STEER).rig), 2)
+    assert any(message.centerline_mm for message in live)
+    assert {message.frame_id for message in live} == {"robot_base"}
+    in_robot_mm = np.array([message.tip.position_mm for message in live if message.tip is not None])
+    assert len(in_robot_mm) > 0
+    # Where the left camera stands in the robot's frame, and how far it sees.
+    away_mm = np.linalg.norm(in_robot_mm - (412, -80, 950), axis=1)
+    assert ((away_mm > 150) & (away_mm < 350)).all()
+
+
+@pytest.mark.slow
+def test_a_turned_camera_is_told_live_as_soon_as_is_configured(tmp_path: Path) -> None:
+    live = live_and_replayed(tmp_path, registered_before_a_camera_was_turned(AslRecording(STEER).rig), 9)
+    assert not any("calibration_drift" in message.reasons for message in live[:4])
+    assert (live[-1].status, "calibration_drift" in live[-1].reasons) == (Status.DEGRADED, True)
 
 
 def test_a_second_daemon_of_the_rig_is_refused(tmp_path: Path) -> None:

@@ -114,7 +114,7 @@ if __name__ == "__main__":
 """
 
 
-@pytest.mark.parametrize("both", [False, True])
+@pytest.mark.parametrize("both", [pytest.param(False, marks=pytest.mark.slow), True])
 def test_after_a_sigkill_nothing_but_the_unwritten_tail_is_lost(tmp_path: Path, both: bool) -> None:
     script = tmp_path / "record.py"
     script.write_text(RECORD)

@@ -7,6 +7,7 @@ import signal
 import socket
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -210,11 +211,13 @@ def test_ctrl_c_ends_a_published_replay_with_its_summary(tmp_path: Path) -> None
     )
     with process, Subscriber("small", [endpoint]) as subscriber:
         try:
-            with fifo.open("rb") as tracks:
-                first = TrackMessage.from_json(tracks.readline())
+            # Read without a pause: a pipe holds 64 kB, half a second of tracks, and the subscriber may need a second to
+            # connect. A replay that waits for the reader publishes nothing meanwhile.
+            with ThreadPoolExecutor(1) as pool, fifo.open("rb") as tracks:
+                written = pool.submit(tracks.read)
                 received = subscriber.next(WAIT_S)
                 process.send_signal(signal.SIGINT)
-                tracks.read()
+                first = TrackMessage.from_json(written.result(WAIT_S).splitlines()[0])
             stdout, stderr = process.communicate(timeout=WAIT_S)
         finally:
             process.kill()

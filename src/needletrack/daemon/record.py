@@ -10,12 +10,10 @@ from needletrack.capture.live import LiveSource
 from needletrack.capture.pairing import SkewReport
 from needletrack.config import Config
 from needletrack.daemon.process import schedule_thread
-from needletrack.recording.mcap_file import About
+from needletrack.recording.mcap_file import UNCALIBRATED, About
 from needletrack.recording.recorder import Recorder, RecorderSettings
 from needletrack.records import DropReason
 from needletrack.rig import Rig
-
-UNCALIBRATED = "uncalibrated"
 
 
 @dataclass(frozen=True)
@@ -28,6 +26,13 @@ class RecordSummary:
     duration_s: float
     megabytes: float
     skew: SkewReport
+
+
+def both_cameras(config: Config, kernel: Kernel | None = None) -> LiveSource:
+    """Both cameras as configured; kernel: where they are (None: this machine's)."""
+    return LiveSource(
+        config.cameras, tolerance_us=config.pairing.tolerance_us, offset_us=config.pairing.offset_us, kernel=kernel
+    )
 
 
 def record(
@@ -44,9 +49,7 @@ def record(
 
     Raises CaptureError, RecordingError.
     """
-    cameras = LiveSource(
-        config.cameras, tolerance_us=config.pairing.tolerance_us, offset_us=config.pairing.offset_us, kernel=kernel
-    )
+    cameras = both_cameras(config, kernel)
     name = UNCALIBRATED if rig is None else rig.name
     settings = RecorderSettings(
         output.parent,

@@ -6,6 +6,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass
+from datetime import UTC, datetime
 from enum import IntEnum
 
 import numpy as np
@@ -17,6 +18,7 @@ from needletrack.capture.source import FrameSource
 from needletrack.config import Config
 from needletrack.daemon.metrics import Metrics
 from needletrack.daemon.process import AlreadyRunning, OnlyInstance, lock_memory, schedule_thread, settle_memory
+from needletrack.daemon.record import both_cameras
 from needletrack.daemon.systemd import Notifier
 from needletrack.errors import CaptureError, ConfigError
 from needletrack.publish.message import RunContext, Source, TrackMessage, WireCamera, WireRecording, WireSkew
@@ -85,13 +87,8 @@ class Daemon:
     def __init__(self, rig: Rig, config: Config, *, kernel: Kernel | None = None) -> None:
         require_fit(rig, config)
         self.rig, self.config = rig, config
-        self.context = RunContext(rig.name, Source.LIVE, config.digest, rig.digest)
-        self._cameras = LiveSource(
-            config.cameras,
-            tolerance_us=config.pairing.tolerance_us,
-            offset_us=config.pairing.offset_us,
-            kernel=kernel,
-        )
+        self.context = RunContext(rig.name, Source.LIVE, config.digest, rig.digest, frame_id=rig.frame_id)
+        self._cameras = both_cameras(config, kernel)
         self._recorder: Recorder | None = None
         self.service: Service | None = None
 
@@ -117,6 +114,8 @@ class Daemon:
                 rig,
                 self.context,
                 heartbeat_s=config.publishing.heartbeat_s,
+                drift=config.drift,
+                max_age_days=config.rig.max_age_days,
                 surroundings=self.surroundings,
                 in_threads=self._in_thread,
             )
@@ -129,6 +128,8 @@ class Daemon:
             opened.enter_context(_Pulse(notifier, service, self._cameras))
             notifier.ready("waiting for both cameras")
             ready()
+            if warning := rig.age_warning(config.rig.max_age_days, datetime.now(UTC)):
+                _log.warning("%s", warning)
             _log.info("the daemon runs", extra={"rig_digest": rig.digest, "config_digest": config.digest})
             sinks: list[Sink] = [_Published(publisher), metrics]
             if self._recorder is not None:

@@ -324,6 +324,7 @@ class WireCalibration(WirePart):
     calibrated_at: str | None = Field(description="ISO 8601 date or time, as in the rig file")
     age_days: float | None = Field(description="since then")
     reprojection_rms_px: NotNegative | None = Field(description="over all corners of the board views")
+    warning: str | None = Field(description="a sentence where it is older than `rig.max_age_days` allows")
 
 
 class WireRates(WirePart):
@@ -428,7 +429,8 @@ class StatusMessage(WirePart):
             uptime_s=None if run.deterministic else _rounded_or_none(uptime_s, 3),
             heartbeat_s=heartbeat_s,
             last_sequence=last_sequence,
-            calibration=calibration or WireCalibration(calibrated_at=None, age_days=None, reprojection_rms_px=None),
+            calibration=calibration
+            or WireCalibration(calibrated_at=None, age_days=None, reprojection_rms_px=None, warning=None),
             rates=rates or WireRates(pairs_per_s=0.0, tracks_per_s={}),
             dropped=_counted(dropped or {}),
             counters=dict(sorted((counters or {}).items())),

@@ -134,7 +134,9 @@ def example_messages() -> tuple[TrackMessage, StatusMessage]:
         published_at_ns=EXAMPLE_UNIX_NS + 9_000_000,
         uptime_s=20.1,
         last_sequence=1207,
-        calibration=WireCalibration(calibrated_at="2026-05-01T12:00:00Z", age_days=27.9, reprojection_rms_px=0.11),
+        calibration=WireCalibration(
+            calibrated_at="2026-05-01T12:00:00Z", age_days=27.9, reprojection_rms_px=0.11, warning=None
+        ),
         rates=WireRates(pairs_per_s=60.0, tracks_per_s={"ok": 59.4, "degraded": 0.4, "invalid": 0.2}),
         dropped=dropped,
         counters={"pairs": 1208},

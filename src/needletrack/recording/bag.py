@@ -4,6 +4,7 @@ import weakref
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from threading import Lock
 from typing import Any
 
 import cv2
@@ -18,9 +19,11 @@ from needletrack.recording.asl import ListedFrame, ListedPair, Loss, UnusablePai
 from needletrack.recording.mcap_file import (
     LEFT_TOPIC,
     RIGHT_TOPIC,
+    UNCALIBRATED,
     About,
     PairWriter,
     image_cdr,
+    size_only_rig,
     typestore,
 )
 from needletrack.recording.pairing import in_order, pair_by_stamp
@@ -52,7 +55,8 @@ class _Stored:
 class BagRecording:
     """The pairs of a ROS 1 or ROS 2 bag with two topics of images (raw or compressed), by their headers' stamps.
 
-    topics: left and right; None where the names tell them apart. The whole bag is read once for its stamps. Raises
+    topics: left and right; None where the names tell them apart. without_rig: where none is named, go on with one that
+    knows the images' size and nothing else. The whole bag is read once for its stamps. Raises
     RecordingError where it is no bag, or its topics are not two; CalibrationError without a rig.
     """
 
@@ -63,11 +67,13 @@ class BagRecording:
         *,
         tolerance_us: float = 1000.0,
         topics: tuple[str, str] | None = None,
+        without_rig: bool = False,
     ) -> None:
         self.folder = Path(path)
-        if rig is None:
+        if rig is None and not without_rig:
             raise CalibrationError(f"{self.folder}: a bag holds no rig: name one with --rig")
-        self.rig = rig
+        # Board pictures are read by several threads; the reader is one file with one place in it.
+        self._lock = Lock()
         self._reader = _opened(self.folder)
         self._close_reader = weakref.finalize(self, self._reader.close)
         self._topics = _two_topics(self.folder, self._reader, topics)
@@ -81,6 +87,7 @@ class BagRecording:
                 f"{tolerance_us:g} us: see pairing.tolerance_us"
             )
         self._stored = [(ordered[0][i], ordered[1][j]) for i, j in near]
+        self.rig = rig or size_only_rig(self._first_size_px(), UNCALIBRATED)
         self.pairs: Sequence[ListedPair] = tuple(
             ListedPair(ListedFrame(self.folder, l.stamp_ns), ListedFrame(self.folder, r.stamp_ns))
             for l, r in self._stored
@@ -131,12 +138,20 @@ class BagRecording:
             found.append(_Stored(stamp.sec * 1_000_000_000 + stamp.nanosec, recorded_ns))
         return found
 
+    def _first_size_px(self) -> tuple[int, int]:
+        try:
+            height, width = _gray(self._message(self._topics[0], self._stored[0][0])).shape
+        except ValueError as error:
+            raise RecordingError(f"{self.folder}: its first image cannot be read: {error}") from error
+        return width, height
+
     def _message(self, connection: Connection, stored: _Stored) -> Any:
         at = stored.recorded_ns
-        for _, _, raw in self._reader.messages([connection], start=at, stop=at + 1):
-            message = self._deserialized(connection, raw)
-            if message.header.stamp.sec * 1_000_000_000 + message.header.stamp.nanosec == stored.stamp_ns:
-                return message
+        with self._lock:
+            for _, _, raw in self._reader.messages([connection], start=at, stop=at + 1):
+                message = self._deserialized(connection, raw)
+                if message.header.stamp.sec * 1_000_000_000 + message.header.stamp.nanosec == stored.stamp_ns:
+                    return message
         raise ValueError("the image is not there any more")
 
     def _deserialized(self, connection: Connection, raw: bytes) -> Any:

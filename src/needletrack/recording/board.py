@@ -3,10 +3,11 @@
 import csv
 import os
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from datetime import datetime
+from itertools import pairwise
 from pathlib import Path
 from typing import Protocol
 
@@ -28,11 +29,10 @@ from needletrack.calibration.worth import (
     space_grid_mm,
 )
 from needletrack.errors import CalibrationError, RecordingError
-from needletrack.geometry.camera import Camera
-from needletrack.geometry.transform import RigidTransform
-from needletrack.recording.asl import AslRecording
-from needletrack.recording.png import png_size
-from needletrack.recording.replay import ReplaySource
+from needletrack.recording.asl import UnusablePair
+from needletrack.recording.bag import is_bag
+from needletrack.recording.replay import ReplaySource, StoredRecording
+from needletrack.recording.stored import open_pictures
 from needletrack.records import Float, Image, StereoPair
 from needletrack.rig import CalibrationInfo, CalibrationUncertainty, Rig
 from needletrack.tracking.needle import Workspace
@@ -41,6 +41,11 @@ _METHOD = "needletrack calibrate"
 _SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm", ".ppm")
 # Without a workspace that both cameras see, the error is told where the boards were.
 _LEAST_POINTS = 8
+# Pictures taken one by one are further apart.
+_FILM_S = 0.5
+# Looked at in each stretch of a film, and how much smaller, to find the stillest pair.
+_TRIED, _SMALLER = 6, 8
+_LISTING_HEADER = "#timestamp [ns],filename\n"
 
 
 class BoardPictures(Protocol):
@@ -55,16 +60,21 @@ class BoardPictures(Protocol):
 
 
 class _Recorded:
-    """The pairs of an EuRoC / ASL folder."""
+    """Pairs of a recording of any kind, by their indices; all of them without any."""
 
-    def __init__(self, folder: Path) -> None:
-        self._recording = AslRecording(folder, _before_calibration(folder))
-        self.source = folder.resolve().name
-        self.size_px = self._recording.rig.left.size_px
-        self.names = tuple(pair.left.path.name for pair in self._recording.pairs)
+    def __init__(self, recording: StoredRecording, indices: Sequence[int] | None = None) -> None:
+        self._recording = recording
+        self._indices = range(len(recording)) if indices is None else indices
+        self.source = recording.folder.resolve().name
+        self.size_px = recording.rig.left.size_px
+        files = [recording.pairs[index].left.path for index in self._indices]
+        self.names = tuple(
+            f"pair {index}" if file == recording.folder else file.name
+            for index, file in zip(self._indices, files, strict=True)
+        )
 
     def read(self, index: int) -> tuple[Image, Image]:
-        pair = self._recording.read(index)
+        pair = self._recording.read(self._indices[index])
         return pair.left.image, pair.right.image
 
 
@@ -95,13 +105,17 @@ class _Folders:
         return images[0], images[1]
 
 
-def open_board_pictures(folder: Path, right: Path | None = None) -> BoardPictures:
-    """The pairs of an EuRoC / ASL folder, of two folders of pictures, or of one with left* and right*.
+def open_board_pictures(
+    folder: Path, right: Path | None = None, *, most: int | None = None, tolerance_us: float = 1000.0
+) -> BoardPictures:
+    """The pairs of a recording of any kind, of two folders of pictures, or of one with left* and right*.
 
-    Raises RecordingError where there are none.
+    most: of a recording that runs like a film, look at so many pairs at most: of each stretch the stillest one.
+    tolerance_us: greatest difference of a recorded pair's stamps. Raises RecordingError where there are none.
     """
-    if right is None and (folder / "cam0" / "data.csv").exists():
-        return _Recorded(folder)
+    if right is None and (folder.is_file() or is_bag(folder) or (folder / "cam0" / "data.csv").exists()):
+        recording = open_pictures(folder, tolerance_us=tolerance_us)
+        return _Recorded(recording, None if most is None else _stillest(recording, most))
     for path in (folder, right):
         if path is not None and not path.is_dir():
             raise RecordingError(f"{path}: there is no such folder")
@@ -110,13 +124,13 @@ def open_board_pictures(folder: Path, right: Path | None = None) -> BoardPicture
         if len(inside) == 2:
             return _Folders(inside["left"], inside["right"])
         if not any(folder.glob("left*")):
-            return _Recorded(folder)  # whose error says what an ASL folder holds
+            return _Recorded(open_pictures(folder))  # whose error says what an ASL folder holds
     return _Folders(folder, right or folder)
 
 
-def board_stream(folder: Path) -> ReplaySource:
-    """A recording of the board as a stream at its own pace, as cameras would give it."""
-    return ReplaySource(AslRecording(folder, _before_calibration(folder)), paced=True)
+def board_stream(path: Path) -> ReplaySource:
+    """A recording of the board, of any kind, as a stream at its own pace, as cameras would give it."""
+    return ReplaySource(open_pictures(path), paced=True)
 
 
 @dataclass(frozen=True, slots=True)
@@ -313,18 +327,19 @@ def described(board: Board) -> str:
 class BoardRecorder:
     """Writes pairs as an EuRoC / ASL folder, so that what was taken live can be calibrated again.
 
-    Raises RecordingError where the folder holds a recording already, or cannot be written.
+    An empty one is begun at once, so that a folder that cannot be written shows before the board is held up. Raises
+    RecordingError where the folder holds pictures already, or cannot be written.
     """
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         for camera in ("cam0", "cam1"):
             listing = folder / camera / "data.csv"
-            if listing.exists():
-                raise RecordingError(f"{listing}: there is a recording already: name a new folder")
             try:
+                if listing.exists() and listing.read_text(encoding="utf-8") != _LISTING_HEADER:
+                    raise RecordingError(f"{listing}: there is a recording already: name a new folder")
                 (folder / camera / "data").mkdir(parents=True, exist_ok=True)
-                listing.write_text("#timestamp [ns],filename\n", encoding="utf-8")
+                listing.write_text(_LISTING_HEADER, encoding="utf-8")
             except OSError as error:
                 raise RecordingError(f"{listing}: cannot be written: {error.strerror or error}") from error
 
@@ -396,10 +411,30 @@ def _significant(value: float) -> float:
     return float(f"{value:.4g}")
 
 
-def _before_calibration(folder: Path) -> Rig:
-    """A rig that knows the images' size and nothing else: pairs are read with it, and nothing is measured."""
-    pictures = sorted((folder / "cam0" / "data").glob("*.png"))
-    width, height = next((size for picture in pictures if (size := png_size(picture))), (640, 480))
-    matrix = np.array([[width, 0.0, width / 2], [0.0, width, height / 2], [0.0, 0.0, 1.0]])
-    camera = Camera(matrix, np.zeros(4), (width, height))
-    return Rig(camera, camera, RigidTransform(np.eye(3), np.array([-60.0, 0.0, 0.0])), "uncalibrated")
+def _stillest(recording: StoredRecording, most: int) -> list[int]:
+    """Indices of so many pairs at most; of a film, from each of so many stretches the pair with the least motion."""
+    count = len(recording)
+    stamps_ns = [pair.left.stamp_ns for pair in (recording.pairs[0], recording.pairs[-1])]
+    if count <= most or (stamps_ns[1] - stamps_ns[0]) / 1e9 > _FILM_S * (count - 1):
+        return list(range(count))
+    edges = np.linspace(0, count - 1, most + 1).round().astype(int).tolist()
+    chosen = []
+    for start, end in pairwise(edges):
+        tried = np.unique(np.linspace(start, end - 1, min(_TRIED, end - start)).round().astype(int)).tolist()
+        motion = [_motion_gray(recording, index) for index in tried]
+        chosen.append(tried[int(np.argmin(motion))])
+    return chosen
+
+
+def _motion_gray(recording: StoredRecording, index: int) -> float:
+    """How much the left picture changes until the next pair, mean gray; infinite where either cannot be read."""
+    try:
+        small = [
+            cv2.resize(
+                recording.read(at).left.image, None, fx=1 / _SMALLER, fy=1 / _SMALLER, interpolation=cv2.INTER_AREA
+            )
+            for at in (index, index + 1)
+        ]
+    except UnusablePair:
+        return float("inf")
+    return float(np.mean(cv2.absdiff(small[0], small[1])))

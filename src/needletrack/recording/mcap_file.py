@@ -75,6 +75,8 @@ _QOS = """\
 """
 
 
+# The name of what is recorded before there is a rig.
+UNCALIBRATED = "uncalibrated"
 # What reading a file raises whose end is missing.
 _CUT_OFF = (McapError, struct.error, ValueError, zstandard.ZstdError, KeyError)
 

@@ -9,7 +9,8 @@ import cv2
 from needletrack.errors import RecordingError
 from needletrack.recording.asl import AslRecording, UnusablePair
 from needletrack.recording.bag import BagRecording, Copied, is_bag, write_bag, write_recording
-from needletrack.recording.mcap_file import McapRecording, is_recording
+from needletrack.recording.mcap_file import UNCALIBRATED, McapRecording, is_recording, size_only_rig
+from needletrack.recording.png import png_size
 from needletrack.recording.replay import StoredRecording
 from needletrack.rig import RIG_FILE, Rig, write_rig
 
@@ -24,6 +25,21 @@ def open_stored(path: Path, rig: Rig | None = None, *, tolerance_us: float = 100
     if is_bag(path):
         return BagRecording(path, rig, tolerance_us=tolerance_us)
     return AslRecording(path, rig, tolerance_us=tolerance_us)
+
+
+def open_pictures(path: Path, *, tolerance_us: float = 1000.0) -> StoredRecording:
+    """The recording at a path for its images alone: it needs no rig, and one that does not fit is no fault.
+
+    Raises RecordingError.
+    """
+    if path.is_file() and is_recording(path):
+        return McapRecording(path, without_rig=True)
+    if is_bag(path):
+        return BagRecording(path, tolerance_us=tolerance_us, without_rig=True)
+    pictures = sorted((path / "cam0" / "data").glob("*.png"))
+    # One whose images are all broken says so itself.
+    size_px = next((size for picture in pictures if (size := png_size(picture))), (640, 480))
+    return AslRecording(path, size_only_rig(size_px, UNCALIBRATED), tolerance_us=tolerance_us)
 
 
 def export(path: Path, output: Path, to: Literal["asl", "ros2"], rig: Rig | None = None) -> Copied:

@@ -6,7 +6,8 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -104,40 +105,53 @@ from tests.recording.test_recorder import ABOUT, SIZE_PX, pair
 from needletrack.recording.recorder import Recorder, RecorderSettings
 if __name__ == "__main__":
     recorder = Recorder(RecorderSettings(Path(sys.argv[1]), Path(sys.argv[1]) / "r.mcap"), ABOUT, SIZE_PX)
-    for number in range(2000):
+    count = int(sys.argv[2])
+    for number in range(count):
         while not recorder.offer(pair(number % 50)):
             time.sleep(0.01)
-    while recorder.recorded < 2000:
+    while recorder.recorded < count:
         recorder._collect(0.1)
     print(recorder.pid, flush=True)
     time.sleep(600)
 """
 
 
-@pytest.mark.parametrize("both", [pytest.param(False, marks=pytest.mark.slow), True])
-def test_after_a_sigkill_nothing_but_the_unwritten_tail_is_lost(tmp_path: Path, both: bool) -> None:
+@contextmanager
+def recorded_by_another(tmp_path: Path, count: int) -> Iterator[int]:
+    """A process that has recorded so many pairs and goes on; gives the id of its writing process; killed at the end."""
     script = tmp_path / "record.py"
     script.write_text(RECORD)
-    root = Path(__file__).parents[2]
     with subprocess.Popen(
-        [sys.executable, script, tmp_path],
+        [sys.executable, script, tmp_path, str(count)],
         stdout=subprocess.PIPE,
         text=True,
-        env={**os.environ, "PYTHONPATH": str(root)},
+        env={**os.environ, "PYTHONPATH": str(Path(__file__).parents[2])},
     ) as process:
         assert process.stdout is not None
-        writing = int(process.stdout.readline())
-        if both:
-            os.kill(writing, signal.SIGKILL)
-        process.kill()
-    file = tmp_path / "r.mcap"
-    if both:
-        # A chunk of 8 MB holds 1300 of these small pairs.
-        assert recover(file, tmp_path / "saved.mcap").pairs >= 2000 - 1366
-        return
-    # The daemon alone was killed: the writing process notices and finishes the file.
-    wait_for(lambda: not Path(f"/proc/{writing}").exists())
-    assert len(McapRecording(file)) == 2000
+        try:
+            yield int(process.stdout.readline())
+        finally:
+            process.kill()
+
+
+def test_after_a_sigkill_of_both_nothing_but_the_unwritten_tail_is_lost(tmp_path: Path) -> None:
+    with recorded_by_another(tmp_path, 2000) as writing:
+        os.kill(writing, signal.SIGKILL)
+    # A chunk of 8 MB holds 1300 of these small pairs.
+    assert recover(tmp_path / "r.mcap", tmp_path / "saved.mcap").pairs >= 2000 - 1366
+
+
+def test_after_a_sigkill_of_the_daemon_alone_the_file_is_finished(tmp_path: Path) -> None:
+    def is_whole() -> bool:
+        try:
+            return len(McapRecording(tmp_path / "r.mcap")) == 100
+        except RecordingError:
+            return False
+
+    with recorded_by_another(tmp_path, 100):
+        assert not is_whole()
+    # The writing process notices.
+    wait_for(is_whole)
 
 
 def test_a_disk_with_too_little_space_pauses_before_the_first_pair(tmp_path: Path) -> None:

@@ -211,7 +211,7 @@ def test_ctrl_c_ends_a_published_replay_with_its_summary(tmp_path: Path) -> None
     )
     with process, Subscriber("small", [endpoint]) as subscriber:
         try:
-            # Read without a pause: a pipe holds 64 kB, half a second of tracks, and the subscriber may need a second to
+            # Read without a pause: a pipe holds 64 kB, a second of such tracks, and the subscriber may need as long to
             # connect. A replay that waits for the reader publishes nothing meanwhile.
             with ThreadPoolExecutor(1) as pool, fifo.open("rb") as tracks:
                 written = pool.submit(tracks.read)

@@ -20,10 +20,14 @@ PATIENCE_S = 10.0
 
 
 class NewestPairs:
-    """A source that gives its newest pair: to look for a board takes longer than a frame, and the cameras go on."""
+    """A source that gives its newest pair: to look for a board takes longer than a frame, and the cameras go on.
+
+    has_begun: whether it gave one.
+    """
 
     def __init__(self, source: FrameSource) -> None:
         self._source = source
+        self.has_begun = False
 
     @property
     def dropped(self) -> Mapping[DropReason, int]:
@@ -33,6 +37,7 @@ class NewestPairs:
     def pairs(self, stop: threading.Event) -> Iterator[StereoPair]:
         """The newest pair each time; sets `stop` on every way out."""
         for arrival in newest_pairs(self._source, LatestSlot(), stop):
+            self.has_begun = True
             yield arrival.pair
 
 
@@ -53,22 +58,19 @@ def collect_live(
     """
     cameras = both_cameras(config, kernel)
     recorder = BoardRecorder(folder)
-    came, gave_up = threading.Event(), threading.Event()
+    newest = NewestPairs(cameras)
+    gave_up = threading.Event()
 
     def give_up() -> None:
-        if not came.is_set() and not stop.is_set():
+        if not newest.has_begun and not stop.is_set():
             gave_up.set()
             stop.set()
-
-    def told_of(guidance: Guidance) -> None:
-        came.set()
-        told(guidance)
 
     patience = threading.Timer(PATIENCE_S, give_up)
     patience.daemon = True
     patience.start()
     try:
-        last = collect(NewestPairs(cameras), board, recorder, stop, told_of, enough=enough)
+        last = collect(newest, board, recorder, stop, told, enough=enough)
     finally:
         patience.cancel()
     if gave_up.is_set() and last is None:

@@ -335,17 +335,6 @@ def test_systemd_is_told_when_it_is_ready_that_it_lives_and_that_it_stops(
             assert told == b"STOPPING=1"
 
 
-@pytest.fixture
-def logs_as_before() -> Iterator[None]:
-    """`run` sets the process's logs up for good; of a test's process they are others' too."""
-    logger = logging.getLogger("needletrack")
-    before = logger.handlers, logger.propagate, logger.level
-    yield
-    logger.handlers, logger.propagate = before[:2]
-    logger.setLevel(before[2])
-
-
-@pytest.mark.usefixtures("logs_as_before")
 def test_the_command_says_what_is_wrong_in_one_line_with_its_code(tmp_path: Path) -> None:
     write_rig(small_rig(), tmp_path / "rig.yaml")
     (tmp_path / "small.toml").write_text("[cameras]\nsize_px = [64, 48]\n")

@@ -89,6 +89,8 @@ def brought_to_end(
         raise ValueError("a curve that was cut cannot be fitted once more")
     fit = adjusted.fitting.fit(adjusted.observed, ends, parameters.systematic_px[adjusted.appearance.inside])
     arc = arc_length(fit.points_mm)
+    # The curve as fitted once more may be a little shorter than it was.
+    at_mm = min(at_mm, float(arc[-1]))
     count = max(8, round(at_mm / spacing_mm) + 1)
     cut = np.interp(np.linspace(0.0, at_mm, count), arc, fit.parameters)
     # What was seen of a section is told of the point of the curve next to it.

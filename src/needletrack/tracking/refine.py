@@ -59,16 +59,14 @@ _TIP_MOVED_MM = 0.3
 _PAIRS_PER_APPEARANCE = 8
 # Less than so much that looks like more of a needle beyond an end is none.
 _GOES_ON_MM = 1.5
+# Between two pairs the tip is not expected to come further than this; the curve is kept so far beyond, mm.
+_MOST_ADVANCE_MM, _STEADY_BEYOND_MM = 3.0, 3.0
 # Nor is it off from where its motion would take it by more than a few of these, a second.
 _ADVANCE_SIGMA_MM_S = 18.0
 # Images without stamps are of a sequence as fast as cameras are.
 _USUAL_S = 1 / 30
-# And this far beyond where it is expected the curve is kept, mm.
-_STEADY_BEYOND_MM = 3.0
 # Weaknesses of a track that is followed nevertheless: its shape is that of the needle, to its end.
 _STEADY_DESPITE = {Reason.TIP_DISAGREES, Reason.HIGH_UNCERTAINTY}
-# Between two pairs the tip is not expected to come further than this.
-_MOST_ADVANCE_MM = 3.0
 
 
 class RefineParameters(BaseModel):
@@ -156,7 +154,9 @@ def refine(
     """
     steady = _steady(previous, since_s, models.needle)
     if steady is not None and not steady.is_due and clipped_share(images, rig, steady.points_mm).max() < WORTH_A_LOOK:
-        return _refined_steady(images, rig, steady, models)
+        refined = _refined_steady(images, rig, steady, models)
+        if refined is not None:
+            return refined
     if steady is None:
         followed = _follow(images, rig, points_mm, models, previous)
     else:
@@ -226,8 +226,11 @@ class _Ended:
     ends: Ends
 
 
-def _refined_steady(images: Images, rig: StereoRig, steady: _Steady, models: RefineModels) -> Refined:
-    """The needle where it was moved to since, looked at once: what it looks like and where its base is are known."""
+def _refined_steady(images: Images, rig: StereoRig, steady: _Steady, models: RefineModels) -> Refined | None:
+    """The needle where it was moved to since, looked at once: what it looks like and where its base is are known.
+
+    None where its tip lies beyond what was looked at.
+    """
     spacing = models.refine.spacing_mm
     foreseen_mm = float(arc_length(steady.points_mm)[-1])
     foreseen_mm += float(np.clip(steady.advance_mm, -_MOST_ADVANCE_MM, _MOST_ADVANCE_MM))
@@ -250,12 +253,14 @@ def _refined_steady(images: Images, rig: StereoRig, steady: _Steady, models: Ref
     if tip.at_mm < models.needle.min_length_mm / 2:
         raise NeedleNotFound("refine", Reason.TOO_SHORT)
     arc = arc_length(moved.fit.points_mm)
+    if tip.at_mm > arc[-1]:
+        return None
     index = int(np.abs(arc - tip.at_mm).argmin())
     left, right = (
         (_end_observation(moved.fit.points_mm, index, camera, pose, each - arc[index], sigma),)
         for camera, pose, each, sigma in zip(*_views(rig), tip.each_mm, tip.sigma_mm, strict=True)
     )
-    final = brought_to_end(moved, min(tip.at_mm, float(arc[-1])), (left, right), spacing, models.fit)
+    final = brought_to_end(moved, tip.at_mm, (left, right), spacing, models.fit)
     return _with_tip(images, rig, _Ended(tip, along_mm, final, (left, right)), models, base_is_known=True)
 
 

@@ -598,3 +598,23 @@ def test_a_notebook_needs_no_stamps() -> None:
     curve = tracked("dark").curve
     assert curve is not None
     np.testing.assert_array_equal(found.curve.points_mm, curve.points_mm)
+
+
+@pytest.mark.parametrize("by_mm", [-6.0, -2.0, 2.0, 7.0])
+def test_a_tip_that_leaps_between_two_pairs_is_found_where_it_is(by_mm: float) -> None:
+    # Followed at a glance a tip is looked for within 3 mm of where it is expected: beyond, more is looked at.
+    first = seen_at(with_needle(length_mm=Wave(64.0)))
+    before = track_pair(first.pair, RIG)
+    assert before.status is Status.OK
+    shown = seen_at(with_needle(length_mm=Wave(64.0 + by_mm)))
+    stamp_ns = before.captured_at_ns + 33_333_333
+    pair = replace(
+        shown.pair,
+        left=replace(shown.pair.left, captured_at_ns=stamp_ns),
+        right=replace(shown.pair.right, captured_at_ns=stamp_ns),
+    )
+    found = track_pair(pair, RIG, None, before)
+    result = score(found, TrueShape.drawn(shown.truth))
+    assert found.status is Status.OK, found.reasons
+    assert result.tip_mm is not None
+    assert result.tip_mm < TIP_MM

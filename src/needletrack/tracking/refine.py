@@ -469,7 +469,7 @@ def _follow(
         reach = 0 if grown_mm > min(models.refine.settled_mm, reaches[reach] / 2) else reach + 1
         if remaining == 0 or reach == len(reaches):
             break
-        if reach > 0 and not _may_go_on(images, rig, part, max(reaches), models):
+        if reach > 0 and not _anything_beyond(images, rig, part, max(reaches), models):
             break
         points = _extended(part.fit.points_mm, reaches[reach], spacing)
     if length_mm < models.needle.min_length_mm / 2:
@@ -477,7 +477,7 @@ def _follow(
     return part
 
 
-def _may_go_on(images: Images, rig: StereoRig, part: Adjusted, reach_mm: float, models: RefineModels) -> bool:
+def _anything_beyond(images: Images, rig: StereoRig, part: Adjusted, reach_mm: float, models: RefineModels) -> bool:
     """Whether anything beyond the ends of the curve, wherever it bends to, looks like a needle at all."""
     spacing = models.refine.spacing_mm
     even = _even(part.fit.points_mm, spacing)

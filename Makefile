@@ -33,7 +33,8 @@ $(PACKAGES): requirements/dev.lock
 	  tail -n 40 $(VENV)/install.log >&2; echo "make: the packages could not be installed; the whole log: $(VENV)/install.log" >&2; exit 1; }
 	@touch $@
 
-$(INSTALLED): $(PACKAGES) pyproject.toml
+# The kernels are compiled by the installation.
+$(INSTALLED): $(PACKAGES) pyproject.toml hatch_build.py $(wildcard src/needletrack/kernels/*.[ch])
 	@$(PIP) install --quiet --no-deps --no-build-isolation --editable .
 	@touch $@
 

@@ -14,6 +14,7 @@ PACKAGE = Path(__file__).parents[1] / "src" / "needletrack"
 FLOORS: dict[str, float] = {
     "errors": 0.0,
     "records": 0.1,
+    "kernels": 0.2,
     "geometry": 1.0,
     "tracking": 2.0,
     "calibration": 2.0,

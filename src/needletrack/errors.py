@@ -35,3 +35,7 @@ class NeedleNotFound(NeedletrackError):
         super().__init__(f"{stage}: {reason}")
         self.stage = stage
         self.reason = reason
+
+
+class InstallationError(NeedletrackError):
+    """The package is not installed as a whole."""

@@ -1,16 +1,16 @@
 """One camera: the pinhole model with OpenCV's radial-tangential (and rational) distortion."""
 
 from dataclasses import dataclass
+from functools import cached_property
 
-import cv2
 import numpy as np
 import numpy.typing as npt
 
+from needletrack.geometry.transform import RigidTransform
+from needletrack.kernels import call, packed_lens
 from needletrack.records import Float, frozen_array
 
 DISTORTION_LENGTHS = (4, 5, 8, 12, 14)
-# The inverse of the distortion has no closed form; 1e-10 px is far below any noise and is reached in about 10 rounds.
-_UNDISTORT_UNTIL = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-12)
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,19 +47,23 @@ class Camera:
 
     def project(self, points_mm: npt.ArrayLike) -> Float:
         """Raw pixels (N, 2) of points (N, 3) in this camera's frame; points behind the camera are not defined."""
-        points = np.ascontiguousarray(points_mm, dtype=np.float64).reshape(-1, 1, 3)
-        if len(points) == 0:
-            return np.zeros((0, 2))
-        pixels, _ = cv2.projectPoints(points, np.zeros(3), np.zeros(3), self.matrix, self.distortion)
-        return self._sheared(np.asarray(pixels, dtype=np.float64).reshape(-1, 2), 1.0)
+        points = np.ascontiguousarray(points_mm, dtype=np.float64).reshape(-1, 3)
+        pixels = np.empty((len(points), 2))
+        call("project", self.lens, points, len(points), pixels)
+        return pixels
 
     def undistort(self, points_px: npt.ArrayLike) -> Float:
         """Undistorted pixels (N, 2), under the same camera matrix, of raw pixels (N, 2)."""
-        return self._undistorted(points_px, self.matrix)
+        rays = self.normalize(points_px)
+        skewed = rays @ self.matrix[:2, :2].T
+        return np.asarray(skewed + self.matrix[:2, 2])
 
     def normalize(self, points_px: npt.ArrayLike) -> Float:
         """Normalised image coordinates (N, 2), x / z and y / z, of raw pixels (N, 2)."""
-        return self._undistorted(points_px, np.eye(3))
+        points = np.ascontiguousarray(points_px, dtype=np.float64).reshape(-1, 2)
+        rays = np.empty_like(points)
+        call("normalize", self.lens, points, len(points), rays)
+        return rays
 
     def distort(self, undistorted_px: npt.ArrayLike) -> Float:
         """Raw pixels (N, 2) of undistorted pixels (N, 2)."""
@@ -74,18 +78,24 @@ class Camera:
         upper = np.array(self.size_px) - 1.0 - margin_px
         return np.asarray(((points >= margin_px) & (points <= upper)).all(axis=-1), dtype=np.bool_)
 
-    def _sheared(self, points_px: Float, times: float) -> Float:
-        # OpenCV takes fx, fy, cx, cy from the camera matrix and drops its skew in silence.
-        skew = self.matrix[0, 1]
-        if skew == 0:
-            return points_px
-        rows = (points_px[:, 1] - self.matrix[1, 2]) / self.matrix[1, 1]
-        return np.column_stack([points_px[:, 0] + times * skew * rows, points_px[:, 1]])
+    @cached_property
+    def lens(self) -> Float:
+        """The camera as the kernels take it, at the origin of its own frame."""
+        return packed_lens(self.matrix, self.distortion, self._tilt)
 
-    def _undistorted(self, points_px: npt.ArrayLike, new_matrix: Float) -> Float:
-        points = np.asarray(points_px, dtype=np.float64).reshape(-1, 2)
-        if len(points) == 0:
-            return np.zeros((0, 2))
-        unsheared = np.ascontiguousarray(self._sheared(points, -1.0)).reshape(-1, 1, 2)
-        found = cv2.undistortPoints(unsheared, self.matrix, self.distortion, None, None, new_matrix, _UNDISTORT_UNTIL)
-        return np.asarray(found, dtype=np.float64).reshape(-1, 2)
+    def lens_at(self, camera_from_world: RigidTransform) -> Float:
+        """The camera as the kernels take it, at its pose."""
+        pose = camera_from_world
+        return packed_lens(self.matrix, self.distortion, self._tilt, pose.rotation, pose.translation_mm)
+
+    @property
+    def _tilt(self) -> Float:
+        """How a tilted sensor (terms tau_x, tau_y) pictures the plane of the lens (OpenCV's tilted model)."""
+        if len(self.distortion) < max(DISTORTION_LENGTHS):
+            return np.eye(3)
+        (sin_x, sin_y), (cos_x, cos_y) = np.sin(self.distortion[12:]), np.cos(self.distortion[12:])
+        about_x = np.array([[1, 0, 0], [0, cos_x, sin_x], [0, -sin_x, cos_x]])
+        about_y = np.array([[cos_y, 0, -sin_y], [0, 1, 0], [sin_y, 0, cos_y]])
+        turned = about_y @ about_x
+        onto_plane = np.array([[turned[2, 2], 0, -turned[0, 2]], [0, turned[2, 2], -turned[1, 2]], [0, 0, 1]])
+        return np.asarray(onto_plane @ turned)

@@ -42,6 +42,11 @@ class StereoRig:
         return epipolar.fundamental_matrix(self.left.matrix, self.right.matrix, pose.rotation, pose.translation_mm)
 
     @cached_property
+    def lenses(self) -> tuple[Float, Float]:
+        """Both cameras as the kernels take them, in the left camera's frame."""
+        return self.left.lens, self.right.lens_at(self.right_from_left)
+
+    @cached_property
     def epipoles(self) -> tuple[Float, Float]:
         """Left and right epipole, homogeneous undistorted pixels (3,)."""
         pose = self.right_from_left

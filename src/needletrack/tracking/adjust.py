@@ -162,7 +162,6 @@ def adjust(
         None if streak is None else _line(streak, each, appearance)
         for each, streak in zip(sections, streaks, strict=True)
     )
-    spreads = [np.full(len(points_mm), each) for each in looks.spreads]
 
     fitting = CurveFitting(
         points_mm,
@@ -179,18 +178,18 @@ def adjust(
             for px, each in zip(rig.project(curve_mm), sections, strict=True)
         ]
 
-    def look(at: list[Float], spread: Float) -> tuple[AxisOffsets, AxisOffsets]:
+    def look(at: list[Float], spread: float) -> tuple[tuple[AxisOffsets, AxisOffsets], Float]:
         left, right = (each.offsets(px, spread) for each, px in zip(evidence, at, strict=True))
-        return left, right
+        return (left[0], right[0]), np.stack([left[1], right[1]])
 
     systematic_px = parameters.systematic_px[appearance.inside]
-    for spread in spreads[:-1]:
-        fitting.approach(look(expected, spread), ends)
+    for spread in looks.spreads[:-1]:
+        fitting.approach(look(expected, spread)[0], ends)
         expected = across(fitting.points_mm())
-    observed = look(expected, spreads[-1])
+    observed, _ = look(expected, looks.spreads[-1])
     fit = fitting.fit(observed, ends, systematic_px)
     expected = across(fit.points_mm)
-    support = np.stack([each.support(at, spreads[-1]) for each, at in zip(evidence, expected, strict=True)])
+    _, support = look(expected, looks.spreads[-1])
     if looks is not SETTLED:
         return Adjusted(fit, observed, appearance, support, shines, None, fitting)
     is_shaft = _is_shaft(points_mm, before_tip, needle)

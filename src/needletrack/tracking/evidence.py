@@ -15,9 +15,11 @@ import numpy.typing as npt
 from scipy.interpolate import CubicSpline
 from scipy.special import ndtr
 
+from needletrack.kernels import call
 from needletrack.records import Appearance, Float
 
 Float32 = npt.NDArray[np.float32]
+Mask = npt.NDArray[np.bool_]
 
 # Everything here is in units of which the rig's owner's thickest needle has six across: the same matrices then serve
 # every rig and depth. Sections reach this far to either side of the predicted axis, at this spacing.
@@ -48,9 +50,9 @@ class Grid:
         return np.linspace(self.shifts[0], self.shifts[-1], 4 * (len(self.shifts) - 1) + 1)
 
     @cached_property
-    def refine(self) -> Float:
+    def refine(self) -> Float32:
         """Cubic interpolation (F, S)."""
-        return np.asarray(CubicSpline(self.shifts, np.eye(len(self.shifts)))(self.fine_shifts))
+        return np.asarray(CubicSpline(self.shifts, np.eye(len(self.shifts)))(self.fine_shifts), dtype=np.float32)
 
 
 # Where the axis is nearly known; where it is not; and where it has to be found and known at one look.
@@ -80,23 +82,21 @@ def products(sections: Float) -> Float32:
     leaves nothing to square and sum. Samples are first whitened as if there were background alone: what misfits have in
     common, which is a thousand times what tells them apart, would else leave single precision nothing.
     """
-    centered = sections - np.median(sections, axis=1, keepdims=True)
-    white = (_reference() @ centered.T).astype(np.float32)
-    first, second = _PAIRS
-    return np.concatenate([white[first] * white[second], np.ones((1, len(sections)), np.float32)]).T
+    contiguous = np.ascontiguousarray(sections, dtype=np.float64)
+    shown = np.empty((len(contiguous), len(_PAIRS[0]) + 1), np.float32)
+    call("products", contiguous, len(contiguous), len(OFFSETS), _reference(), shown)
+    return shown
 
 
 def log_evidence(shown: Float32, appearance: Appearance, grid: Grid) -> Float:
     """Log evidence (N, S) of the axis at each shift of the grid, for the `products` of sections of unit noise."""
-    even, cluttered = log_evidence_by_background(shown, appearance, grid)
-    return either(even, cluttered).astype(np.float64)
+    return either(log_evidence_by_background(shown, appearance, grid)).astype(np.float64)
 
 
-def log_evidence_by_background(shown: Float32, appearance: Appearance, grid: Grid) -> tuple[Float32, Float32]:
-    """The same (N, S) before a background that is even, and before one with clutter."""
+def log_evidence_by_background(shown: Float32, appearance: Appearance, grid: Grid) -> Float32:
+    """The same (N, 2 S): before a background that is even, and then before one with clutter."""
     bank = _bank(float(HALF_WIDTHS[appearance.half_width]), BLURS[appearance.blur], appearance.inside, grid)
-    even, cluttered = np.split(shown @ bank, len(_BACKGROUND_WANDER), axis=1)
-    return even, cluttered
+    return shown @ bank
 
 
 def log_evidence_of_no_needle(shown: Float32, blur: int) -> Float:
@@ -104,22 +104,29 @@ def log_evidence_of_no_needle(shown: Float32, blur: int) -> Float:
 
     The edge is that of something wide: of a sleeve, a rod, a vessel beside the curve. It may be anywhere.
     """
-    nothing = _evidence(shown, _bank(0.0, BLURS[blur], 0, _HERE))[:, 0]
-    edge = _evidence(shown, _edge_bank(BLURS[blur]))
-    likeliest = edge.max(axis=1)
-    anywhere = likeliest + np.log(np.exp(edge - likeliest[:, None]).mean(axis=1))
-    return np.asarray(np.logaddexp(nothing, anywhere), dtype=np.float64)
+    each = shown @ _no_needle_bank(BLURS[blur])
+    log = np.empty(len(shown))
+    call("no_needle", each, len(shown), each.shape[1] // len(_BACKGROUND_WANDER) - 1, log)
+    return log
 
 
-def _evidence(shown: Float32, bank: Float32) -> Float32:
-    even, cluttered = np.split(shown @ bank, len(_BACKGROUND_WANDER), axis=1)
-    return either(even, cluttered)
+def either(by_background: Float32) -> Float32:
+    """Log evidence (N, S) of one background or the other, from that of each, (N, 2 S)."""
+    count, both = by_background.shape
+    log = np.empty((count, both // 2), np.float32)
+    call("either_of_both", by_background, count, both // 2, log)
+    return log
 
 
-def either(one: Float32, other: Float32) -> Float32:
-    """Log evidence (N, S) of one or the other, from that of each."""
-    # np.logaddexp takes three times as long.
-    return np.asarray(np.maximum(one, other) + np.log1p(np.exp(-np.abs(one - other))))
+def over_none(by_background: Float32, none: Float) -> tuple[Float, Mask]:
+    """Log evidence (N, S) of a needle over that of none (N,), from `log_evidence_by_background`.
+
+    And whether (N,) it is likelier before clutter.
+    """
+    count, both = by_background.shape
+    log, cluttered = np.empty((count, both // 2)), np.empty(count, np.bool_)
+    call("over_none", by_background, none, count, both // 2, log, cluttered)
+    return log, cluttered
 
 
 _PAIRS = np.triu_indices(len(OFFSETS))
@@ -157,9 +164,10 @@ def _bank(half_width: float, blur: float, inside: int, grid: Grid) -> Float32:
 
 
 @lru_cache(maxsize=64)
-def _edge_bank(blur: float) -> Float32:
-    """A single edge at every sample but the outermost ones."""
-    return _as_bank(*_forms(_covariances(OFFSETS - OFFSETS[2:-2, None], _EDGE_HALF_WIDTH, blur, 0)))
+def _no_needle_bank(blur: float) -> Float32:
+    """Background alone, then a single edge at every sample but the outermost ones."""
+    edge = _as_bank(*_forms(_covariances(OFFSETS - OFFSETS[2:-2, None], _EDGE_HALF_WIDTH, blur, 0)))
+    return np.hstack([_bank(0.0, blur, 0, _HERE), edge])
 
 
 def _as_bank(forms: Float, log_determinants: Float) -> Float32:

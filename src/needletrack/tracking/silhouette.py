@@ -8,11 +8,10 @@ Diameter, blur of the lens and liveliness of the inside are the same all along t
 from dataclasses import dataclass
 from functools import cached_property
 
-import cv2
 import numpy as np
 
 from needletrack.geometry.camera import Camera
-from needletrack.geometry.spline import tangents
+from needletrack.kernels import call
 from needletrack.records import Appearance, Float, Image, Int
 from needletrack.tracking.evidence import (
     BLURS,
@@ -21,15 +20,16 @@ from needletrack.tracking.evidence import (
     LIVELY,
     OFFSETS,
     UNITS_PER_MAX_DIAMETER,
+    Float32,
     Grid,
-    either,
     log_evidence,
     log_evidence_by_background,
     log_evidence_of_no_needle,
+    over_none,
     products,
 )
 from needletrack.tracking.needle import Needle
-from needletrack.tracking.profile import Mask, noise_gray
+from needletrack.tracking.profile import Mask
 
 # A section is the mean of so many rows across the needle, about a pixel apart.
 _ROWS_PER_SECTION = 5
@@ -40,6 +40,7 @@ _UNIT_PER_NOISE = 0.7
 _USED = 2.0
 # A section may be of something else altogether, at this log density.
 _LOG_OUTLIER = -12.0
+_OUTLIER = float(np.exp(_LOG_OUTLIER))
 _LOG_NEVER = -1e4
 # Log odds against the axis turning aside from a nearly right curve, per unit.
 _TURN_PRICE = 6.0
@@ -113,31 +114,57 @@ def diameter_mm(appearance: Appearance, needle: Needle) -> float:
 
 def cut_sections(image: Image, camera: Camera, local_mm: Float, needle: Needle) -> Sections:
     """The sections across a curve (N, 3) in this camera's frame, evenly spaced, one about each point."""
-    step = np.gradient(local_mm, axis=0) / _ROWS_PER_SECTION
-    at = np.arange(_ROWS_PER_SECTION) - (_ROWS_PER_SECTION - 1) / 2
-    strip = straightened(
-        image, camera, (local_mm[:, None] + at[:, None] * step[:, None]).reshape(-1, 3), OFFSETS, needle
-    )
-    unit_gray = max(_LEAST_UNIT_GRAY, _UNIT_PER_NOISE * noise_gray(strip))
-    center = camera.project(local_mm)
-    along = tangents(center)
-    return Sections(
+    local = np.ascontiguousarray(local_mm)
+    count, columns = len(local), len(OFFSETS)
+    center, normal = np.empty((count, 2)), np.empty((count, 2))
+    values, scale, inside = np.empty((count, columns)), np.empty(count), np.empty(count, np.bool_)
+    call(
+        "cut_sections",
+        *_rows_of(image),
+        camera.lens,
+        local,
+        count,
+        _ROWS_PER_SECTION,
+        OFFSETS,
+        columns,
+        unit_mm(needle),
+        _LEAST_UNIT_GRAY,
+        _UNIT_PER_NOISE,
+        np.empty(_ROWS_PER_SECTION * count * (7 + columns)),
         center,
-        np.column_stack([-along[:, 1], along[:, 0]]),
-        strip.reshape(len(local_mm), _ROWS_PER_SECTION, -1).mean(axis=1) / unit_gray,
-        camera.focal_px / local_mm[:, 2] * unit_mm(needle),
-        camera.contains(center, margin_px=2.0),
+        normal,
+        values,
+        scale,
+        inside,
     )
+    return Sections(center, normal, values, scale, inside)
 
 
 def straightened(image: Image, camera: Camera, local_mm: Float, offsets: Float, needle: Needle) -> Float:
     """Grey levels (N, len(offsets)) across a curve (N, 3) in this camera's frame; offsets in units (`evidence.py`)."""
-    rows_px = camera.project(local_mm)
-    along = tangents(rows_px)
-    normal = np.column_stack([-along[:, 1], along[:, 0]])
-    across = offsets * (camera.focal_px / local_mm[:, 2] * unit_mm(needle))[:, None]
-    x, y = ((rows_px[:, None, k] + across * normal[:, None, k]).astype(np.float32) for k in (0, 1))
-    return np.asarray(cv2.remap(image, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE), dtype=np.float64)
+    local = np.ascontiguousarray(local_mm)
+    gray = np.empty((len(local), len(offsets)), np.float32)
+    pixels, normal = np.empty((2, len(local), 2))
+    call(
+        "straighten",
+        *_rows_of(image),
+        camera.lens,
+        local,
+        len(local),
+        offsets,
+        len(offsets),
+        unit_mm(needle),
+        pixels,
+        normal,
+        gray,
+    )
+    return gray.astype(np.float64)
+
+
+def _rows_of(image: Image) -> tuple[Image, int, int, int]:
+    """An image as the kernels take it: its bytes, rows, columns, and bytes from row to row."""
+    contiguous = np.ascontiguousarray(image)
+    return contiguous, *contiguous.shape, contiguous.shape[1]
 
 
 def estimate_appearance(
@@ -207,104 +234,114 @@ class AxisEvidence:
     grid: Grid
     shines: Mask
 
-    def offsets(self, expected_px: Float, spread: Float) -> AxisOffsets:
-        """The axis where it is expected at expected_px (N,), give or take spread (N,) units."""
-        scale = self.sections.px_per_unit
-        offset, sigma = _sites(self._likelihood, self.grid.fine_shifts, expected_px / scale, spread)
-        seen = np.isfinite(sigma) & (self.support(expected_px, spread) > _USED)
-        return AxisOffsets(
-            self.sections.center_px,
-            self.sections.normal,
-            np.where(seen, offset, 0.0) * scale,
-            np.where(seen, sigma * np.where(self.cluttered & self.shines, _CLUTTERED, 1.0), np.inf) * scale,
+    def offsets(self, expected_px: Float, spread: float) -> tuple[AxisOffsets, Float]:
+        """The axis where it is expected at expected_px (N,), give or take spread units.
+
+        And the log Bayes factor (N,) of a needle there over none.
+
+        Moments of evidence times expectation, with the expectation taken out again (expectation propagation, Minka
+        2001): of several places that the evidence allows, the one that is expected counts. sigma is infinite where the
+        section adds nothing.
+        """
+        count, grid, sections = len(self.log_evidence), self.grid, self.sections
+        most, relative, likelihood = self._prepared
+        offset, sigma, support = np.empty((3, count))
+        call(
+            "sites",
+            most,
+            relative,
+            likelihood,
+            count,
+            float(grid.shifts[0]),
+            float(grid.shifts[1] - grid.shifts[0]),
+            len(grid.shifts),
+            float(grid.fine_shifts[1] - grid.fine_shifts[0]),
+            len(grid.fine_shifts),
+            np.ascontiguousarray(expected_px),
+            spread,
+            sections.px_per_unit,
+            sections.inside,
+            self.cluttered & self.shines,
+            _LEAST_GAIN,
+            _LEAST_SIGMA,
+            _USED,
+            _CLUTTERED,
+            offset,
+            sigma,
+            support,
         )
+        return AxisOffsets(sections.center_px, sections.normal, offset, sigma), support
 
     def likeliest_path_px(self) -> Float:
         """Offsets (N,) px of the likeliest axis from end to end, which may turn aside, at a price (Viterbi 1967)."""
-        most, _ = self._relative
-        log = np.maximum(self.log_evidence - most[:, None], _LOG_OUTLIER)
         shifts = self.grid.shifts
-        price = _TURN_PRICE * np.abs(shifts[:, None] - shifts)
-        for i in range(1, len(log)):
-            log[i] += (log[i - 1][:, None] - price).max(axis=0)
-        path = np.empty(len(log), np.int64)
-        path[-1] = log[-1].argmax()
-        for i in range(len(log) - 1, 0, -1):
-            path[i - 1] = (log[i - 1] - price[path[i]]).argmax()
+        path = likeliest_path(self._floored, _TURN_PRICE * float(shifts[1] - shifts[0]))
         return np.asarray(shifts[path] * self.sections.px_per_unit)
 
     def likeliest_motion_px(self) -> Float:
         """Offsets (N,) px of the likeliest axis that moved as a whole: alike everywhere, or ever more to one end."""
-        most, _ = self._relative
-        log = np.maximum(self.log_evidence - most[:, None], _LOG_OUTLIER)
-        count = len(self.grid.shifts)
-        step = self.grid.shifts[1] - self.grid.shifts[0]
-        along = np.linspace(-0.5, 0.5, len(log))
-        drift = np.rint(_DRIFTS[:, None] * along / step).astype(np.int64)
-        index = np.arange(count)[:, None] + drift[:, None]
-        told = np.where(
-            (index >= 0) & (index < count), log[np.arange(len(log)), np.clip(index, 0, count - 1)], _LOG_OUTLIER
+        log, shifts = self._floored, self.grid.shifts
+        moved = np.empty(len(log))
+        step = float(shifts[1] - shifts[0])
+        call(
+            "best_motion",
+            log,
+            len(log),
+            len(shifts),
+            _DRIFTS,
+            len(_DRIFTS),
+            step,
+            _MOTION_PRICE,
+            _LOG_OUTLIER,
+            moved,
         )
-        worth = told.sum(axis=2) - _MOTION_PRICE * self.grid.shifts**2
-        best = np.unravel_index(int(worth.argmax()), worth.shape)
-        return np.asarray((self.grid.shifts[best[1]] + drift[best[0]] * step) * self.sections.px_per_unit)
+        return np.asarray(moved * self.sections.px_per_unit)
 
-    def support(self, expected_px: Float, spread: Float) -> Float:
-        """Log Bayes factor (N,) of a needle about expected_px (N,), give or take spread (N,) units, over none there."""
-        expected = expected_px / self.sections.px_per_unit
-        near = _bell(self.grid.shifts, expected, spread)
-        most, relative = self._relative
-        mean = (relative * near).sum(axis=1) / near.sum(axis=1)
-        support = most + np.log(np.maximum(mean, 1e-300))
-        return np.where(self.sections.inside & (np.abs(expected) < self.grid.shifts[-1]), support, -np.inf)
+    @property
+    def _floored(self) -> Float:
+        """The log evidence (N, S) over its most; a section may be of something else altogether."""
+        most, _, _ = self._prepared
+        return np.maximum(self.log_evidence - most[:, None], _LOG_OUTLIER)
 
     @cached_property
-    def _relative(self) -> tuple[Float, Float]:
-        """The most log evidence (N,) of each section, and the evidence (N, S) over that."""
-        most = np.maximum(self.log_evidence.max(axis=1), _LOG_NEVER)
-        return most, np.exp(self.log_evidence - most[:, None])
+    def _prepared(self) -> tuple[Float, Float32, Float32]:
+        """The most log evidence (N,) of each section; the evidence (N, S) over that; and at finer shifts (N, F)."""
+        grid, (count, places) = self.grid, self.log_evidence.shape
+        most = np.empty(count)
+        relative = np.empty((count, places), np.float32)
+        likelihood = np.empty((count, len(grid.fine_shifts)), np.float32)
+        call(
+            "prepared",
+            self.log_evidence,
+            count,
+            places,
+            grid.refine,
+            len(grid.fine_shifts),
+            _LOG_NEVER,
+            _OUTLIER,
+            most,
+            relative,
+            likelihood,
+        )
+        return most, relative, likelihood
 
-    @cached_property
-    def _likelihood(self) -> Float:
-        """The evidence (N, F) at finer shifts, over its most, or of something else altogether."""
-        curve = np.maximum(self.log_evidence, _LOG_NEVER) @ self.grid.refine.T
-        return np.asarray(np.exp(curve - curve.max(axis=1, keepdims=True)) + np.exp(_LOG_OUTLIER))
+
+def likeliest_path(worth: Float, turn_price: float) -> Int:
+    """Columns (N,) of the path through (N, places) worth most; each place aside has its price (Viterbi 1967)."""
+    total = np.array(worth, order="C")
+    path = np.empty(len(total), np.int64)
+    call("best_path", total, *total.shape, turn_price, path)
+    return path
 
 
 def axis_evidence(sections: Sections, appearance: Appearance, half_widths: Int, grid: Grid) -> AxisEvidence:
     """The evidence of sections whose half widths (N,), as indices into HALF_WIDTHS, differ; -1: too thin to say."""
     log = np.full((len(sections.values), len(grid.shifts)), -np.inf)
     cluttered = np.zeros(len(log), dtype=np.bool_)
+    shown = products(sections.values)
+    none = log_evidence_of_no_needle(shown, appearance.blur)
     for width in np.unique(half_widths[half_widths >= 0]):
         rows = half_widths == width
         each = Appearance(int(width), appearance.blur, appearance.inside)
-        shown = products(sections.values[rows])
-        before_even, before_clutter = log_evidence_by_background(shown, each, grid)
-        log[rows] = either(before_even, before_clutter) - log_evidence_of_no_needle(shown, appearance.blur)[:, None]
-        cluttered[rows] = before_clutter.max(axis=1) > before_even.max(axis=1)
+        log[rows], cluttered[rows] = over_none(log_evidence_by_background(shown[rows], each, grid), none[rows])
     return AxisEvidence(sections, log, cluttered, grid, np.zeros(len(log), dtype=np.bool_))
-
-
-def _bell(shifts: Float, expected: Float, spread: Float) -> Float:
-    """Gaussians (N, S) about the expected places (N,), over their most at any shift."""
-    squared = ((shifts - expected[:, None]) / spread[:, None]) ** 2
-    return np.asarray(np.exp(-0.5 * (squared - squared.min(axis=1, keepdims=True))))
-
-
-def _sites(likelihood: Float, shifts: Float, expected: Float, spread: Float) -> tuple[Float, Float]:
-    """Offset and sigma (N,), units, that each section contributes, where the axis is expected at expected +- spread.
-
-    Moments of evidence times expectation, with the expectation taken out again (expectation propagation, Minka 2001):
-    of several places that the evidence allows, the one that is expected counts. sigma is infinite where the section
-    adds nothing.
-    """
-    weight = likelihood * _bell(shifts, expected, spread)
-    weight /= weight.sum(axis=1, keepdims=True)
-    mean = weight @ shifts
-    variance = (weight * (shifts - mean[:, None]) ** 2).sum(axis=1)
-    variance = np.maximum(variance, _LEAST_SIGMA**2 / 4)
-    precision = 1 / variance - 1 / spread**2
-    told = precision > _LEAST_GAIN / spread**2
-    precision = np.where(told, precision, 1.0)
-    offset = np.where(told, (mean / variance - expected / spread**2) / precision, 0.0)
-    return offset, np.where(told, np.hypot(precision**-0.5, _LEAST_SIGMA), np.inf)

@@ -9,11 +9,12 @@ and it shows where the silhouette does not: before a vessel that runs along the 
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.ndimage import correlate1d
 
-from needletrack.records import Float, Int
+from needletrack.kernels import call
+from needletrack.records import Float
 from needletrack.tracking.evidence import ACROSS_STEP, OFFSETS
 from needletrack.tracking.profile import Mask
+from needletrack.tracking.silhouette import likeliest_path
 
 # A line of light this wide, units across, and this much above what is beside it, in noise.
 _LINE_SIGMA, _LEAST_CONTRAST, _MOST_CONTRAST = 0.8, 10.0, 40.0
@@ -43,13 +44,15 @@ def find_streak(values: Float, half_widths: Float, axis: Float) -> Streak | None
 
     half_widths (N,) of the needle there, and where its axis is, (N,), units.
     """
-    contrast = correlate1d(values, _line(), axis=1, mode="nearest")
+    contrast = np.empty_like(values)
+    call("contrast", values, *values.shape, _LINE, len(_LINE), contrast)
     within = np.abs(OFFSETS - axis[:, None]) < _WITHIN_SHARE * half_widths[:, None]
     worth = np.where(within, np.clip(contrast, 0.0, _MOST_CONTRAST), -_MOST_CONTRAST)
     ever = np.flatnonzero(within.any(axis=0))
     if len(ever) == 0:
         return None
-    at = np.clip(ever[_brightest_path(worth[:, ever])], 1, len(OFFSETS) - 2)
+    path = likeliest_path(worth[:, ever], _TURN_PRICE * ACROSS_STEP)
+    at = np.clip(ever[path], 1, len(OFFSETS) - 2)
     rows = np.arange(len(at))
     for _ in range(2):
         beside = contrast[rows[:, None], at[:, None] + np.arange(-1, 2)]
@@ -66,22 +69,11 @@ def find_streak(values: Float, half_widths: Float, axis: Float) -> Streak | None
     return Streak(offset, np.where(seen, sigma, np.inf))
 
 
-def _brightest_path(worth: Float) -> Int:
-    """Columns (N,) of the path through (N, places) that is worth most; turning aside has its price (Viterbi 1967)."""
-    places = np.arange(worth.shape[1])
-    price = _TURN_PRICE * ACROSS_STEP * np.abs(places[:, None] - places)
-    log = worth.copy()
-    for i in range(1, len(log)):
-        log[i] += (log[i - 1] - price).max(axis=1)
-    path = np.empty(len(log), np.int64)
-    path[-1] = log[-1].argmax()
-    for i in range(len(log) - 1, 0, -1):
-        path[i - 1] = (log[i - 1] - price[path[i]]).argmax()
-    return path
-
-
 def _line() -> Float:
     at = np.arange(-3.0, 3.01, ACROSS_STEP) / _LINE_SIGMA
     line = (1 - at**2) * np.exp(-0.5 * at**2)
     line -= line.mean()
     return np.asarray(line / np.linalg.norm(line))
+
+
+_LINE = _line()

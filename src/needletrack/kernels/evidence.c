@@ -1,0 +1,233 @@
+/* From cross sections to where the axis is: the log evidence of `tracking/evidence.py` and what is read from it. */
+#include "kernels.h"
+
+#define MOST_SAMPLES 64
+
+/* The products (n, f) of every two whitened samples of sections (n, count), and 1. whitener: (count, count). */
+EXPORT void products(const double *sections, int64_t n, int64_t count, const double *whitener, float *out) {
+  int64_t width = count * (count + 1) / 2 + 1;
+  for (int64_t i = 0; i < n; i++) {
+    const double *section = sections + i * count;
+    double sorted[MOST_SAMPLES], centered[MOST_SAMPLES];
+    float white[MOST_SAMPLES];
+    for (int64_t k = 0; k < count; k++) {
+      int64_t at = k;
+      while (at > 0 && sorted[at - 1] > section[k]) sorted[at] = sorted[at - 1], at--;
+      sorted[at] = section[k];
+    }
+    double median = count % 2 ? sorted[count / 2] : (sorted[count / 2 - 1] + sorted[count / 2]) / 2;
+    for (int64_t k = 0; k < count; k++) centered[k] = section[k] - median;
+    for (int64_t k = 0; k < count; k++) {
+      double sum = 0;
+      for (int64_t j = 0; j < count; j++) sum += whitener[k * count + j] * centered[j];
+      white[k] = (float)sum;
+    }
+    float *row = out + i * width;
+    for (int64_t k = 0; k < count; k++) {
+      for (int64_t j = k; j < count; j++) row[j - k] = white[k] * white[j];
+      row += count - k;
+    }
+    *row = 1;
+  }
+}
+
+/* Log evidence (n, s) of one or the other of two (n, s) each that lie in one array, row by row; see `either`. */
+EXPORT void either_of_both(const float *both, int64_t n, int64_t s, float *out) {
+  for (int64_t i = 0; i < n; i++) {
+    const float *one = both + 2 * i * s, *other = one + s;
+    for (int64_t k = 0; k < s; k++) {
+      float more = one[k] > other[k] ? one[k] : other[k], apart = fabsf(one[k] - other[k]);
+      out[i * s + k] = more + log_one_plus_exp_negative(apart);
+    }
+  }
+}
+
+/* Log evidence (n,) of background alone, or of one edge between two, which may be anywhere: each before both kinds of
+   background, in one array (n, 2 + 2 edges). */
+EXPORT void no_needle(const float *each, int64_t n, int64_t edges, double *out) {
+  for (int64_t i = 0; i < n; i++) {
+    const float *flat = each + 2 * i * (1 + edges), *one = flat + 2, *other = one + edges;
+    float most = flat[0] > flat[1] ? flat[0] : flat[1];
+    double alone = (double)most + log_one_plus_exp_negative(fabsf(flat[0] - flat[1]));
+    float any[2 * MOST_SAMPLES], likeliest = -INFINITY;
+    for (int64_t k = 0; k < edges; k++) {
+      float more = one[k] > other[k] ? one[k] : other[k];
+      any[k] = more + log_one_plus_exp_negative(fabsf(one[k] - other[k]));
+    }
+    for (int64_t k = 0; k < edges; k++) likeliest = any[k] > likeliest ? any[k] : likeliest;
+    double sum = 0;
+    for (int64_t k = 0; k < edges; k++) sum += exp_negative(any[k] - likeliest);
+    double anywhere = (double)likeliest + log(sum / (double)edges);
+    double larger = alone > anywhere ? alone : anywhere;
+    out[i] = larger + log1p(exp(-fabs(alone - anywhere)));
+  }
+}
+
+/* Log evidence (n, s) of a needle over none, and whether (n,) it is likelier before clutter. */
+EXPORT void over_none(const float *both, const double *none, int64_t n, int64_t s, double *log, uint8_t *cluttered) {
+  for (int64_t i = 0; i < n; i++) {
+    const float *even = both + 2 * i * s, *clutter = even + s;
+    float most_even = -INFINITY, most_clutter = -INFINITY;
+    for (int64_t k = 0; k < s; k++) {
+      float more = even[k] > clutter[k] ? even[k] : clutter[k];
+      log[i * s + k] = (double)(more + log_one_plus_exp_negative(fabsf(even[k] - clutter[k]))) - none[i];
+      most_even = even[k] > most_even ? even[k] : most_even;
+      most_clutter = clutter[k] > most_clutter ? clutter[k] : most_clutter;
+    }
+    cluttered[i] = most_clutter > most_even;
+  }
+}
+
+/* The evidence of each section, ready to be asked.
+
+   log (n, s) -> most (n,), relative (n, s) over it, and likelihood (n, f) at finer shifts over its most, plus
+   `outlier`. refine (f, s) interpolates; a section that knows nothing has `never`. */
+EXPORT void prepared(const double *log, int64_t n, int64_t s, const float *refine, int64_t f, double never,
+                     float outlier, double *most, float *relative, float *likelihood) {
+  float curve[512];
+  for (int64_t i = 0; i < n; i++) {
+    const double *row = log + i * s;
+    double top = never;
+    for (int64_t k = 0; k < s; k++) top = row[k] > top ? row[k] : top;
+    most[i] = top;
+    float *mine = relative + i * s, low[256];
+    for (int64_t k = 0; k < s; k++) {
+      double off = row[k] - top;
+      low[k] = (float)(off > never ? off : never);
+    }
+    for (int64_t k = 0; k < s; k++) mine[k] = exp_negative(low[k]);
+    float highest = -INFINITY;
+    for (int64_t j = 0; j < f; j++) {
+      const float *weights = refine + j * s;
+      float sum = 0;
+      for (int64_t k = 0; k < s; k++) sum += weights[k] * low[k];
+      curve[j] = sum;
+    }
+    for (int64_t j = 0; j < f; j++) highest = curve[j] > highest ? curve[j] : highest;
+    for (int64_t j = 0; j < f; j++) likelihood[i * f + j] = exp_negative(curve[j] - highest) + outlier;
+  }
+}
+
+/* Weights of a Gaussian at evenly spaced places over its most at any of them: [first, last) are not nothing. */
+static void bell(double expected, double spread, double low, double step, int64_t count, float *out, int64_t *first,
+                 int64_t *last) {
+  int64_t near = (int64_t)floor((expected - low) / step + 0.5);
+  near = near < 0 ? 0 : near >= count ? count - 1 : near;
+  double off = low + step * (double)near - expected, precision = 1 / (spread * spread);
+  double shrink = exp(-step * step * precision);
+  out[near] = 1;
+  double value = 1, ratio = exp(-(step * off + step * step / 2) * precision);
+  int64_t i = near;
+  for (i = near + 1; i < count; i++) {
+    value *= ratio, ratio *= shrink;
+    if (value < 1e-14) break;
+    out[i] = (float)value;
+  }
+  *last = i;
+  value = 1, ratio = exp(-(-step * off + step * step / 2) * precision);
+  for (i = near - 1; i >= 0; i--) {
+    value *= ratio, ratio *= shrink;
+    if (value < 1e-14) break;
+    out[i] = (float)value;
+  }
+  *first = i + 1;
+}
+
+/* What each section contributes where the axis is expected, px: see `silhouette._sites` and `AxisEvidence.support`.
+
+   grid = (low, step, s) of the shifts, and (low, step, f) of the finer ones. least_gain, least_sigma, used and
+   clutter_factor as named there; doubtful (n,): where the last applies. sigma is infinite where the section says
+   nothing. */
+EXPORT void sites(const double *most, const float *relative, const float *likelihood, int64_t n, double low,
+                  double step, int64_t s, double fine_step, int64_t f, const double *expected_px, double spread,
+                  const double *px_per_unit, const uint8_t *inside, const uint8_t *doubtful, double least_gain,
+                  double least_sigma, double used, double clutter_factor, double *offset_px, double *sigma_px,
+                  double *support) {
+  float weight[512];
+  double reach = low + step * (double)(s - 1);
+  for (int64_t i = 0; i < n; i++) {
+    double scale = px_per_unit[i], expected = expected_px[i] / scale;
+    int64_t first, last;
+    offset_px[i] = 0, sigma_px[i] = INFINITY, support[i] = -INFINITY;
+    if (!(fabs(expected) < 1e6)) continue;
+    bell(expected, spread, low, step, s, weight, &first, &last);
+    double sum = 0, norm = 0;
+    for (int64_t k = first; k < last; k++) sum += (double)(relative[i * s + k] * weight[k]), norm += weight[k];
+    double mean = sum / norm;
+    if (inside[i] && fabs(expected) < reach) support[i] = most[i] + log(mean > 1e-300 ? mean : 1e-300);
+    if (!offset_px) continue;
+    bell(expected, spread, low, fine_step, f, weight, &first, &last);
+    double total = 0, moment = 0, square = 0;
+    for (int64_t k = first; k < last; k++) {
+      double w = (double)(likelihood[i * f + k] * weight[k]), at = low + fine_step * (double)k;
+      total += w, moment += w * at, square += w * at * at;
+    }
+    double middle = moment / total, variance = square / total - middle * middle;
+    double least = least_sigma * least_sigma / 4;
+    variance = variance > least ? variance : least;
+    double prior = 1 / (spread * spread), precision = 1 / variance - prior;
+    if (!(precision > least_gain * prior) || !(support[i] > used)) continue;
+    offset_px[i] = (middle / variance - expected * prior) / precision * scale;
+    sigma_px[i] = sqrt(1 / precision + least_sigma * least_sigma) * (doubtful[i] ? clutter_factor : 1) * scale;
+  }
+}
+
+/* The path (n,) through (n, s) that is worth most where turning aside costs `price` per place (Viterbi 1967).
+
+   worth is overwritten. */
+EXPORT void best_path(double *worth, int64_t n, int64_t s, double price, int64_t *path) {
+  for (int64_t i = 1; i < n; i++) {
+    const double *before = worth + (i - 1) * s;
+    double ahead[512];
+    /* The dearest step is as long as the section is wide: a distance transform, there and back. */
+    ahead[0] = before[0];
+    for (int64_t k = 1; k < s; k++) {
+      double carried = ahead[k - 1] - price;
+      ahead[k] = before[k] > carried ? before[k] : carried;
+    }
+    for (int64_t k = s - 2; k >= 0; k--) {
+      double carried = ahead[k + 1] - price;
+      ahead[k] = ahead[k] > carried ? ahead[k] : carried;
+    }
+    for (int64_t k = 0; k < s; k++) worth[i * s + k] += ahead[k];
+  }
+  int64_t at = 0;
+  for (int64_t k = 1; k < s; k++) at = worth[(n - 1) * s + k] > worth[(n - 1) * s + at] ? k : at;
+  path[n - 1] = at;
+  for (int64_t i = n - 1; i > 0; i--) {
+    double most = -INFINITY;
+    for (int64_t k = 0; k < s; k++) {
+      double value = worth[(i - 1) * s + k] - price * fabs((double)(path[i] - k));
+      if (value > most) most = value, at = k;
+    }
+    path[i - 1] = at;
+  }
+}
+
+/* The likeliest motion of the whole curve: see `AxisEvidence.likeliest_motion_px`. log (n, s) over its most, floored. */
+EXPORT void best_motion(const double *log, int64_t n, int64_t s, const double *drifts, int64_t d, double step,
+                        double motion_price, double floor_log, double *shift) {
+  double most = -INFINITY, worth[512];
+  int64_t best_drift = 0, best_place = 0;
+  for (int64_t j = 0; j < d; j++) {
+    for (int64_t k = 0; k < s; k++) {
+      double place = ((double)k - (double)(s - 1) / 2) * step;
+      worth[k] = -motion_price * place * place;
+    }
+    for (int64_t i = 0; i < n; i++) {
+      int64_t off = (int64_t)rint(drifts[j] * (-0.5 + (double)i / (double)(n - 1)) / step);
+      const double *row = log + i * s;
+      int64_t first = off < 0 ? -off : 0, last = off > 0 ? s - off : s;
+      first = first > s ? s : first, last = last < first ? first : last;
+      for (int64_t k = 0; k < first; k++) worth[k] += floor_log;
+      for (int64_t k = first; k < last; k++) worth[k] += row[k + off];
+      for (int64_t k = last; k < s; k++) worth[k] += floor_log;
+    }
+    for (int64_t k = 0; k < s; k++)
+      if (worth[k] > most) most = worth[k], best_drift = j, best_place = k;
+  }
+  for (int64_t i = 0; i < n; i++) {
+    int64_t off = (int64_t)rint(drifts[best_drift] * (-0.5 + (double)i / (double)(n - 1)) / step);
+    shift[i] = (double)(best_place - (s - 1) / 2 + off) * step;
+  }
+}

@@ -1,0 +1,110 @@
+"""The compiled library: found, loaded and called."""
+
+import ctypes
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from needletrack.errors import InstallationError
+
+Array = npt.NDArray[Any]
+
+_HERE = Path(__file__).parent
+BASELINE, WITH_AVX2 = _HERE / "kernels.so", _HERE / "kernels-v3.so"
+
+
+def load(path: Path) -> ctypes.CDLL:
+    """The library at a path; raises InstallationError where it cannot be loaded."""
+    try:
+        library = ctypes.CDLL(str(path))
+    except OSError as error:
+        raise InstallationError(
+            f"{path}: the compiled kernels cannot be loaded ({error}); install needletrack again, with a C compiler"
+            " at hand: make env, or pip install"
+        ) from error
+    for name in ("noise", "streak_misfit"):
+        library[name].restype = ctypes.c_double
+    library["best_lag"].restype = ctypes.c_int64
+    return library
+
+
+def best_library() -> Path:
+    """The library for this machine's processor."""
+    return WITH_AVX2 if WITH_AVX2.exists() and load(BASELINE)["has_v3"]() else BASELINE
+
+
+_library = load(best_library())
+
+
+def address(array: Array | None) -> int | None:
+    """Where the values of a C-contiguous array lie; the caller keeps it alive. Raises ValueError for any other."""
+    if array is None:
+        return None
+    if not array.flags.c_contiguous:
+        raise ValueError("a kernel reads arrays that are contiguous")
+    return int(array.__array_interface__["data"][0])
+
+
+def call(name: str, *arguments: Array | float | int | ctypes.Structure | ctypes.Array[Any]) -> Any:
+    """What the kernel of that name returns; arrays are handed over as pointers, whole numbers as int64."""
+    passed: list[Any] = []
+    for argument in arguments:
+        if isinstance(argument, np.ndarray):
+            passed.append(ctypes.c_void_p(address(argument)))
+        elif isinstance(argument, float):
+            passed.append(ctypes.c_double(argument))
+        elif isinstance(argument, int):
+            passed.append(ctypes.c_int64(argument))
+        else:
+            passed.append(ctypes.byref(argument) if isinstance(argument, ctypes.Structure) else argument)
+    return _library[name](*passed)
+
+
+def packed_lens(
+    matrix: Array, distortion: Array, tilt: Array, rotation: Array | None = None, translation_mm: Array | None = None
+) -> Array:
+    """A camera as the kernels know it: matrix (3, 3), distortion (n,) in OpenCV's order, tilt (3, 3), and its pose."""
+    terms = np.zeros(12)
+    terms[: min(12, len(distortion))] = distortion[:12]
+    packed = np.concatenate(
+        [
+            [matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2], matrix[0, 1]],
+            terms,
+            tilt.ravel(),
+            np.eye(3).ravel() if rotation is None else rotation.ravel(),
+            np.zeros(3) if translation_mm is None else translation_mm,
+        ]
+    )
+    packed.flags.writeable = False
+    return packed
+
+
+class Sight(ctypes.Structure):
+    """What one view measures of a curve, as `fit.c` lays it out. `keep` holds the arrays it points to."""
+
+    _fields_: Sequence[tuple[str, Any]] = [
+        ("camera", ctypes.c_void_p),
+        ("here_px", ctypes.c_void_p),
+        ("ahead", ctypes.c_void_p),
+        ("offset_px", ctypes.c_void_p),
+        ("sigma_px", ctypes.c_void_p),
+        ("ends", ctypes.c_int64),
+        ("end_index", ctypes.c_void_p),
+        ("end_here_px", ctypes.c_void_p),
+        ("end_ahead", ctypes.c_void_p),
+        ("end_sigma_px", ctypes.c_void_p),
+        ("lines", ctypes.c_int64),
+        ("line_index", ctypes.c_void_p),
+        ("line_offset_px", ctypes.c_void_p),
+        ("line_weighted", ctypes.c_void_p),
+        ("line_normal", ctypes.c_void_p),
+        ("count", ctypes.c_int64),
+        ("index", ctypes.c_void_p),
+        ("residual", ctypes.c_void_p),
+        ("rows", ctypes.c_void_p),
+        ("weight", ctypes.c_void_p),
+        ("sigma", ctypes.c_void_p),
+    ]

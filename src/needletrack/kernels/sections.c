@@ -1,0 +1,145 @@
+/* The image straightened along a projected curve, and its cross sections. */
+#include "kernels.h"
+
+/* Cubic convolution (Keys 1981) with a = -0.75, as OpenCV's. */
+static inline void cubic(float t, float *w) {
+  const float a = -0.75f;
+  w[0] = ((a * (t + 1) - 5 * a) * (t + 1) + 8 * a) * (t + 1) - 4 * a;
+  w[1] = ((a + 2) * t - (a + 3)) * t * t + 1;
+  w[2] = ((a + 2) * (1 - t) - (a + 3)) * (1 - t) * (1 - t) + 1;
+  w[3] = 1 - w[0] - w[1] - w[2];
+}
+
+static inline int64_t within(int64_t i, int64_t n) { return i < 0 ? 0 : i >= n ? n - 1 : i; }
+
+static inline float sampled(const uint8_t *image, int64_t rows, int64_t columns, int64_t stride, float x, float y) {
+  float fx = floorf(x), fy = floorf(y), wx[4], wy[4];
+  int64_t ix = (int64_t)fx - 1, iy = (int64_t)fy - 1;
+  cubic(x - fx, wx);
+  cubic(y - fy, wy);
+  float sum = 0;
+  if (ix >= 0 && iy >= 0 && ix + 4 <= columns && iy + 4 <= rows) {
+    const uint8_t *at = image + iy * stride + ix;
+    for (int r = 0; r < 4; r++, at += stride)
+      sum += wy[r] * (wx[0] * at[0] + wx[1] * at[1] + wx[2] * at[2] + wx[3] * at[3]);
+  } else {
+    for (int r = 0; r < 4; r++) {
+      const uint8_t *row = image + within(iy + r, rows) * stride;
+      for (int k = 0; k < 4; k++) sum += wy[r] * wx[k] * row[within(ix + k, columns)];
+    }
+  }
+  return sum < 0 ? 0 : sum > 255 ? 255 : sum;
+}
+
+/* Unit tangents (n, 2) of a polyline (n, 2) by central differences, turned by a quarter: its normals. */
+static void normals(const double *px, int64_t n, double *normal) {
+  for (int64_t i = 0; i < n; i++) {
+    const double *a = px + 2 * (i > 0 ? i - 1 : 0), *b = px + 2 * (i + 1 < n ? i + 1 : n - 1);
+    double dx = b[0] - a[0], dy = b[1] - a[1], length = sqrt(dx * dx + dy * dy);
+    length = length > 1e-300 ? length : 1e-300;
+    normal[2 * i] = -dy / length, normal[2 * i + 1] = dx / length;
+  }
+}
+
+/* Grey levels (n, count) across a curve (n, 3) in the camera's frame, at offsets (count,) of unit_mm; its pixels (n, 2). */
+EXPORT void straighten(const uint8_t *image, int64_t rows, int64_t columns, int64_t stride, const Camera *c,
+                       const double *local_mm, int64_t n, const double *offsets, int64_t count, double unit_mm,
+                       double *px, double *normal, float *gray) {
+  double focal = (c->fx + c->fy) / 2;
+  for (int64_t i = 0; i < n; i++) {
+    const double *p = local_mm + 3 * i;
+    distorted(c, p[0] / p[2], p[1] / p[2], px + 2 * i, 0);
+  }
+  normals(px, n, normal);
+  for (int64_t i = 0; i < n; i++) {
+    double scale = focal / local_mm[3 * i + 2] * unit_mm;
+    double x = px[2 * i], y = px[2 * i + 1], dx = scale * normal[2 * i], dy = scale * normal[2 * i + 1];
+    /* What lies behind the camera, or nowhere, is of no grey. */
+    if (!(fabs(x) < 1e6 && fabs(y) < 1e6 && fabs(dx) < 1e4 && fabs(dy) < 1e4)) {
+      for (int64_t k = 0; k < count; k++) gray[i * count + k] = 0;
+      continue;
+    }
+    for (int64_t k = 0; k < count; k++)
+      gray[i * count + k] =
+          sampled(image, rows, columns, stride, (float)(x + offsets[k] * dx), (float)(y + offsets[k] * dy));
+  }
+}
+
+static float selected(float *v, int64_t n, int64_t k) {
+  int64_t low = 0, high = n - 1;
+  while (low < high) {
+    float pivot = v[(low + high) / 2];
+    int64_t i = low, j = high;
+    while (i <= j) {
+      while (v[i] < pivot) i++;
+      while (v[j] > pivot) j--;
+      if (i <= j) {
+        float t = v[i];
+        v[i++] = v[j], v[j--] = t;
+      }
+    }
+    if (k <= j) high = j;
+    else if (k >= i) low = i;
+    else break;
+  }
+  return v[k];
+}
+
+/* See `profile.noise_gray`: from second differences of every other one of the ten columns at each rim. */
+EXPORT double noise(const float *strip, int64_t n, int64_t count, float *work) {
+  int64_t total = 0;
+  for (int64_t i = 0; i < n; i++) {
+    const float *row = strip + i * count;
+    for (int side = 0; side < 2; side++) {
+      const float *at = side ? row + count - 10 : row;
+      for (int k = 0; k < 3; k++) work[total++] = fabsf(at[2 * k] - 2 * at[2 * k + 2] + at[2 * k + 4]);
+    }
+  }
+  int64_t quiet = (int64_t)(0.8 * (double)total);
+  quiet = quiet < 1 ? 1 : quiet;
+  selected(work, total, quiet - 1);
+  double sum = 0;
+  for (int64_t i = 0; i < quiet; i++) sum += work[i];
+  double sigma = sum / (double)quiet / 0.5586 / sqrt(6.0);
+  return sigma > 0.3 ? sigma : 0.3;
+}
+
+/* The sections about each point of a curve (n, 3): each the mean of `per` rows about a pixel apart, in units of noise.
+
+   work: room for per * n rows, 7 + 8 * count doubles each. least_gray, per_noise: the unit in which they are measured. */
+EXPORT void cut_sections(const uint8_t *image, int64_t rows, int64_t columns, int64_t stride, const Camera *c,
+                         const double *local_mm, int64_t n, int64_t per, const double *offsets, int64_t count,
+                         double unit_mm, double least_gray, double per_noise, double *work, double *center,
+                         double *normal, double *values, double *px_per_unit, uint8_t *inside) {
+  int64_t all = n * per;
+  double *dense = work, *px = dense + 3 * all, *across = px + 2 * all;
+  float *strip = (float *)(across + 2 * all), *spare = strip + all * count;
+  for (int64_t i = 0; i < n; i++) {
+    const double *a = local_mm + 3 * (i > 0 ? i - 1 : 0), *b = local_mm + 3 * (i + 1 < n ? i + 1 : n - 1);
+    double share = (i > 0 && i + 1 < n ? 0.5 : 1.0) / (double)per;
+    for (int64_t r = 0; r < per; r++)
+      for (int k = 0; k < 3; k++)
+        dense[3 * (i * per + r) + k] =
+            local_mm[3 * i + k] + ((double)r - (double)(per - 1) / 2) * share * (b[k] - a[k]);
+  }
+  straighten(image, rows, columns, stride, c, dense, all, offsets, count, unit_mm, px, across, strip);
+  double unit = per_noise * noise(strip, all, count, spare);
+  unit = unit > least_gray ? unit : least_gray;
+  for (int64_t i = 0; i < n; i++) {
+    double *section = values + i * count;
+    for (int64_t k = 0; k < count; k++) section[k] = 0;
+    for (int64_t r = 0; r < per; r++) {
+      const float *row = strip + (i * per + r) * count;
+      for (int64_t k = 0; k < count; k++) section[k] += row[k];
+    }
+    for (int64_t k = 0; k < count; k++) section[k] /= (double)per * unit;
+  }
+  double focal = (c->fx + c->fy) / 2;
+  project(c, local_mm, n, center);
+  normals(center, n, normal);
+  for (int64_t i = 0; i < n; i++) {
+    double x = center[2 * i], y = center[2 * i + 1];
+    px_per_unit[i] = focal / local_mm[3 * i + 2] * unit_mm;
+    inside[i] = x >= 2 && y >= 2 && x <= (double)columns - 3 && y <= (double)rows - 3;
+  }
+}

@@ -1,10 +1,12 @@
 """Smooth curves in space and in the image: arc length, resampling, tangents, curvature, B-spline bases."""
 
+from dataclasses import dataclass
+
 import numpy as np
 import numpy.typing as npt
-from scipy.interpolate import BSpline
 
-from needletrack.records import Float
+from needletrack.kernels import call
+from needletrack.records import Float, Int
 
 DEGREE = 3
 
@@ -43,15 +45,43 @@ def tangents(points: npt.ArrayLike) -> Float:
     return unit(np.gradient(np.asarray(points, dtype=np.float64), axis=0))
 
 
-def clamped_knots(control_points: int) -> Float:
-    """Knot vector (control_points + 4,) of a uniform cubic B-spline on [0, 1] that reaches its end points.
+@dataclass(frozen=True, eq=False)
+class SplineBasis:
+    """The four basis functions that are not 0 at each of N parameters: the first of them (N,), their values (N, 4).
 
-    Raises ValueError below four control points.
+    Of a clamped uniform cubic B-spline on [0, 1] of `control_points` (de Boor 1978), or of its derivative.
+    """
+
+    first: Int
+    mixing: Float
+    control_points: int
+
+    def dense(self) -> Float:
+        """Values (N, control_points) of every basis function."""
+        every = np.zeros((len(self.first), self.control_points))
+        np.put_along_axis(every, self.first[:, None] + np.arange(DEGREE + 1), self.mixing, axis=1)
+        return every
+
+    def curve(self, control: Float) -> Float:
+        """Points (N, 3) for control points (M, 3)."""
+        points = np.empty((len(self.first), 3))
+        call("curve", np.ascontiguousarray(control), self.first, self.mixing, len(points), points)
+        return points
+
+
+def spline_basis(at: npt.ArrayLike, control_points: int, derivative: int = 0) -> SplineBasis:
+    """The basis functions, or their derivative of that order, at parameters (N,), which are clipped to [0, 1].
+
+    Raises ValueError below four control points, or for a derivative beyond the third.
     """
     if control_points < DEGREE + 1:
         raise ValueError(f"a cubic spline needs at least {DEGREE + 1} control points, not {control_points}")
-    inner = np.linspace(0.0, 1.0, control_points - DEGREE + 1)
-    return np.concatenate([np.zeros(DEGREE), inner, np.ones(DEGREE)])
+    if not 0 <= derivative <= DEGREE:
+        raise ValueError(f"a cubic spline has no derivative of order {derivative}")
+    parameters = np.ascontiguousarray(at, dtype=np.float64)
+    first, mixing = np.empty(len(parameters), np.int64), np.empty((len(parameters), DEGREE + 1))
+    call("basis", parameters, len(parameters), control_points, derivative, first, mixing)
+    return SplineBasis(first, mixing, control_points)
 
 
 def basis(at: npt.ArrayLike, control_points: int, derivative: int = 0) -> Float:
@@ -59,8 +89,7 @@ def basis(at: npt.ArrayLike, control_points: int, derivative: int = 0) -> Float:
 
     A curve is `basis(u, len(c)) @ c` for control points c (M, D): linear in c, so that fits are linear too.
     """
-    spline = BSpline(clamped_knots(control_points), np.eye(control_points), DEGREE)
-    return np.asarray(spline(np.clip(np.asarray(at, dtype=np.float64), 0.0, 1.0), nu=derivative), dtype=np.float64)
+    return spline_basis(at, control_points, derivative).dense()
 
 
 def curvature(first: npt.ArrayLike, second: npt.ArrayLike) -> Float:

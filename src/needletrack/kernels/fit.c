@@ -110,7 +110,7 @@ EXPORT void curve(const double *control, const int64_t *first, const double *mix
   curve_of(control, first, mixing, n, points);
 }
 
-static double matern(float scaled) { return (double)((1 + scaled) * exp_negative(-scaled)); }
+static inline double matern(double scaled) { return (1 + scaled) * exp_negative_precise(-scaled); }
 
 /* A streak's line, about points (n, 3): its weights and its normal matrix (see `fit._Line`), and the Cholesky factor of
    what was expected of it, (lines, lines), in `expected`.
@@ -127,8 +127,8 @@ EXPORT int streak_line(const Sight *s, const double *points, const int64_t *firs
   for (int64_t i = 0; i < count; i++) {
     for (int64_t j = 0; j <= i; j++) {
       double alike = dot(along + 3 * i, along + 3 * j, 3), turned = 2 - 2 * alike;
-      float apart = (float)(1.7320508075688772 * fabs(at_mm[i] - at_mm[j]) / change_mm);
-      float turn = (float)(1.7320508075688772 * sqrt(turned > 0 ? turned : 0));
+      double apart = 1.7320508075688772 * fabs(at_mm[i] - at_mm[j]) / change_mm;
+      double turn = 1.7320508075688772 * sqrt(turned > 0 ? turned : 0);
       jumping[i * count + j] = expected[i * count + j] =
           scale * (level + slowly * matern(apart) + bending * matern(turn));
     }

@@ -21,14 +21,11 @@ void distorted(const Camera *c, double x, double y, double *px, double *by_ray);
 /* The ray (x, y, 1) of a raw pixel. */
 void ray_of(const Camera *c, const double *px, double *ray);
 
-/* e^x of single precision for x <= 0, to 1e-6 of itself; below -87 it is nearly 0. */
+/* e^x of single precision for x <= 0, to 1e-5 of itself; below -87 it is nearly 0. */
 static inline float exp_negative(float x) {
   x = x < -87.0f ? -87.0f : x;
-  float n = x * 1.44269504f + 12582912.0f; /* rounds to a whole number in its lowest bits */
-  int32_t bits;
-  memcpy(&bits, &n, sizeof bits);
-  n -= 12582912.0f;
-  float r = x - n * 0.693359375f + n * 2.12194440e-4f;
+  float n = rintf(x * 1.44269504f);
+  float r = x - n * 0.693147181f;
   float p = 1.9875691500e-4f;
   p = p * r + 1.3981999507e-3f;
   p = p * r + 8.3334519073e-3f;
@@ -36,8 +33,31 @@ static inline float exp_negative(float x) {
   p = p * r + 1.6666665459e-1f;
   p = p * r + 5.0000001201e-1f;
   p = p * r * r + r + 1.0f;
-  int32_t power = (bits - 0x4b400000 + 127) << 23;
+  int32_t power = ((int32_t)n + 127) << 23;
   float two;
+  memcpy(&two, &power, sizeof two);
+  return p * two;
+}
+
+/* e^x of double precision for -700 < x <= 0, to 1e-13 of itself (Taylor's series on half of log 2 to either side). */
+static inline double exp_negative_precise(double x) {
+  x = x < -700 ? -700 : x;
+  double n = rint(x * 1.4426950408889634);
+  double r = x - n * 6.931471805599453094e-1;
+  double p = 1.0 / 479001600;
+  p = p * r + 1.0 / 39916800;
+  p = p * r + 1.0 / 3628800;
+  p = p * r + 1.0 / 362880;
+  p = p * r + 1.0 / 40320;
+  p = p * r + 1.0 / 5040;
+  p = p * r + 1.0 / 720;
+  p = p * r + 1.0 / 120;
+  p = p * r + 1.0 / 24;
+  p = p * r + 1.0 / 6;
+  p = p * r + 0.5;
+  p = p * r * r + r + 1.0;
+  int64_t power = (int64_t)((int32_t)n + 1023) << 52;
+  double two;
   memcpy(&two, &power, sizeof two);
   return p * two;
 }

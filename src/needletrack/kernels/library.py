@@ -25,15 +25,15 @@ def load(path: Path) -> ctypes.CDLL:
             f"{path}: the compiled kernels cannot be loaded ({error}); install needletrack again, with a C compiler"
             " at hand: make env, or pip install"
         ) from error
-    for name in ("noise", "streak_misfit"):
-        library[name].restype = ctypes.c_double
-    library["best_lag"].restype = ctypes.c_int64
+    # An item of a library is a new function each time; an attribute is kept.
+    library.streak_misfit.restype = ctypes.c_double
+    library.best_lag.restype = ctypes.c_int64
     return library
 
 
 def best_library() -> Path:
     """The library for this machine's processor."""
-    return WITH_AVX2 if WITH_AVX2.exists() and load(BASELINE)["has_v3"]() else BASELINE
+    return WITH_AVX2 if WITH_AVX2.exists() and load(BASELINE).has_v3() else BASELINE
 
 
 _library = load(best_library())
@@ -60,7 +60,7 @@ def call(name: str, *arguments: Array | float | int | ctypes.Structure | ctypes.
             passed.append(ctypes.c_int64(argument))
         else:
             passed.append(ctypes.byref(argument) if isinstance(argument, ctypes.Structure) else argument)
-    return _library[name](*passed)
+    return getattr(_library, name)(*passed)
 
 
 def packed_lens(
@@ -108,3 +108,8 @@ class Sight(ctypes.Structure):
         ("weight", ctypes.c_void_p),
         ("sigma", ctypes.c_void_p),
     ]
+
+
+def two_sights() -> ctypes.Array[Sight]:
+    """Room for what the left and the right view measure; the arrays they point to are kept alive by the caller."""
+    return (Sight * 2)()

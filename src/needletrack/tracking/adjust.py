@@ -4,7 +4,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from needletrack.geometry.spline import arc_length, basis
+from needletrack.geometry.spline import arc_length, spline_basis
 from needletrack.geometry.stereo import StereoRig
 from needletrack.records import Appearance, Float, Image, Int
 from needletrack.tracking.clipped import WHITE, WORTH_A_LOOK, Flanks, clipped_axis, clipped_share
@@ -96,7 +96,7 @@ def brought_to_end(
     # What was seen of a section is told of the point of the curve next to it.
     nearest = np.abs(fit.parameters - cut[:, None]).argmin(axis=1)
     nearest[-1] = ends[0][0].index
-    points = basis(cut, len(fit.control_mm)) @ fit.control_mm
+    points = spline_basis(cut, len(fit.control_mm)).curve(fit.control_mm)
     left, right = adjusted.observed
     return Adjusted(
         CurveFit(

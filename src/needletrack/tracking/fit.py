@@ -13,19 +13,17 @@ from typing import Protocol
 import numpy as np
 import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict, Field
-from scipy.linalg.lapack import dposv
 
 from needletrack.errors import NeedleNotFound
 from needletrack.geometry.camera import Camera
-from needletrack.geometry.spline import arc_length, basis, resample, tangents
+from needletrack.geometry.spline import arc_length, basis, resample, spline_basis, tangents
 from needletrack.geometry.stereo import StereoRig
-from needletrack.geometry.transform import RigidTransform
-from needletrack.records import Float, Reason
+from needletrack.kernels import Sight, address, call, two_sights
+from needletrack.records import Float, Int, Reason
 from needletrack.tracking.needle import Positive
 
 # Points triangulated from two skeletons scatter by about this much.
 _SKELETON_SIGMA_MM = 0.3
-_IDENTITY = RigidTransform.identity()
 # Sigmas by which a streak's places may be off its line before they count for less.
 _ROBUST_SIGMAS = 2.0
 # Robust weights settle in so many rounds.
@@ -85,14 +83,22 @@ class CurveFit:
 
     def derivative(self, order: int) -> Float:
         """Derivative (N, 3) of the curve by its parameter."""
-        return basis(self.parameters, len(self.control_mm), derivative=order) @ self.control_mm
+        return spline_basis(self.parameters, len(self.control_mm), derivative=order).curve(self.control_mm)
 
     def point_covariance_mm2(self) -> Float:
         """Covariance (N, 3, 3) of every point."""
-        b = basis(self.parameters, len(self.control_mm))
-        m = len(self.control_mm)
-        half = (b @ self.covariance_mm2.reshape(m, 9 * m)).reshape(-1, 3, m, 3)
-        return np.asarray((half.swapaxes(2, 3) @ b[:, None, :, None])[..., 0])
+        b = spline_basis(self.parameters, len(self.control_mm))
+        covariance = np.empty((len(self.parameters), 3, 3))
+        call(
+            "point_covariance",
+            np.ascontiguousarray(self.covariance_mm2),
+            b.control_points,
+            b.first,
+            b.mixing,
+            len(covariance),
+            covariance,
+        )
+        return covariance
 
 
 def initial_curve(points_mm: Float, confidence: Float, spacing_mm: float, parameters: FitParameters) -> Float:
@@ -208,69 +214,71 @@ class CurveFitting:
         bent_for_s: float | None = None,
     ) -> None:
         self._parameters = parameters
+        self._points_mm = np.ascontiguousarray(points_mm)
         self._length = arc_length(points_mm)
         whole = float(self._length[-1])
-        self._u = self._length / whole
         count = _control_count(whole, parameters)
-        self._basis = basis(self._u, count)
-        self._start: Float = np.asarray(np.linalg.lstsq(self._basis, points_mm, rcond=None)[0], dtype=np.float64)
-        self._control = self._start
+        self.basis = spline_basis(self._length / whole, count)
+        dense = self.basis.dense()
+        # Where the points are too few for so many control points these stay near one another.
+        normal = dense.T @ dense + 1e-12 * np.eye(count)
+        self._start = np.linalg.solve(normal, dense.T @ points_mm)
+        self._control = self._start.copy()
         self._smooth = _smoothness_matrix(count, whole, parameters)
-        self._bend = np.zeros_like(self._smooth)
+        self._held = _prior_matrix(points_mm, dense, whole, count, parameters) + self._smooth
         if bent_for_s is not None:
-            self._bend = _bend_matrix(self._u, count, whole, bent_for_s, parameters)
-        self._held = _prior_matrix(points_mm, self._basis, whole, count, parameters) + self._smooth + self._bend
+            self._held += _bend_matrix(len(points_mm), count, whole, bent_for_s, parameters)
         self._share = min(1.0, whole / (len(points_mm) - 1) / parameters.correlation_mm)
+        self._sights = two_sights()
         self._views = [
-            _View(camera, pose, each)
-            for camera, pose, each in zip(
-                (rig.left, rig.right), (_IDENTITY, rig.right_from_left), sections, strict=True
+            _View(sight, camera, lens, each, size=3 * count)
+            for sight, camera, lens, each in zip(
+                self._sights, (rig.left, rig.right), rig.lenses, sections, strict=True
             )
         ]
-        self._lines = [
-            None if streak is None else _Line(view, streak, points_mm, self._length, self._basis, parameters)
+        self._expected = [
+            None if streak is None else self._streak_line(view, streak)
             for view, streak in zip(self._views, streaks, strict=True)
         ]
+        self._normal = np.empty((3 * count, 3 * count))
+
+    @property
+    def parameters(self) -> Float:
+        """Parameters (N,) of the points."""
+        return np.asarray(self._length / self._length[-1])
 
     def points_mm(self) -> Float:
-        """The curve (N, 3) so far; raises NeedleNotFound where it is none."""
-        points = self._basis @ self._control
-        if not np.isfinite(points).all():
-            raise NeedleNotFound("fit", Reason.HIGH_UNCERTAINTY)
-        return np.asarray(points)
+        """The curve (N, 3) so far."""
+        return self.basis.curve(self._control)
 
-    def approach(self, observed: tuple[AcrossObservations, AcrossObservations], ends: Ends = ((), ())) -> "_Approach":
+    def approach(self, observed: tuple[AcrossObservations, AcrossObservations], ends: Ends = ((), ())) -> None:
         """One step of Gauss-Newton from where the curve is, its weights settled in rounds.
 
-        Raises NeedleNotFound where one of the views shows nothing.
+        Raises NeedleNotFound where one of the views shows nothing, or nothing holds a curve.
         """
-        if not (observed[0].seen.any() and observed[1].seen.any()):
-            raise NeedleNotFound("fit", Reason.LOW_COVERAGE)
-        points, moved = self.points_mm(), (self._control - self._start).ravel()
+        for view, each, end in zip(self._views, observed, ends, strict=True):
+            view.look_at(each, end)
+        n, m = len(self._points_mm), self.basis.control_points
+        failed = call(
+            "approach",
+            self._sights,
+            n,
+            m,
+            self.basis.first,
+            self.basis.mixing,
+            self._start,
+            self._control,
+            self._held,
+            self._smooth,
+            self._share,
+            self._parameters.robust_px,
+            _ROUNDS,
+            self._normal,
+            np.empty(3 * n + 3 * m * (6 * m + 4)),
+        )
         # What is measured counts from the start: where no view holds the curve it stays where it was predicted.
-        seen = [
-            view.measured(points, each, end, self._basis, self._share, moved)
-            for view, each, end in zip(self._views, observed, ends, strict=True)
-        ]
-        lines = [line.normal(points, self._basis, moved) for line in self._lines if line is not None]
-        fixed = self._held + sum(normal for normal, _ in lines)
-        pull = sum(pull for _, pull in lines) - self._smooth @ self._start.ravel()
-        normal, weighted, step = fixed, [each.rows for each in seen], moved
-        for _ in range(_ROUNDS):
-            off = [each.residual - each.rows @ step for each in seen]
-            robust = [
-                each.weight / (1 + (left / np.maximum(self._parameters.robust_px, each.sigma_px)) ** 2)
-                for each, left in zip(seen, off, strict=True)
-            ]
-            weighted = [each.rows * each_weight[:, None] for each, each_weight in zip(seen, robust, strict=True)]
-            normal = fixed + sum(w.T @ each.rows for w, each in zip(weighted, seen, strict=True))
-            step = _solved(normal, pull + sum(w.T @ each.residual for w, each in zip(weighted, seen, strict=True)))
-        self._control = self._start + step.reshape(self._start.shape)
-        pulls = [
-            (w[each.is_across].T, self._length[each.index[each.is_across]])
-            for w, each in zip(weighted, seen, strict=True)
-        ]
-        return _Approach(seen, normal, pulls)
+        if failed:
+            raise NeedleNotFound("fit", Reason.LOW_COVERAGE if failed == 1 else Reason.HIGH_UNCERTAINTY)
 
     def fit(
         self,
@@ -280,82 +288,100 @@ class CurveFitting:
     ) -> CurveFit:
         """The curve that the observations agree on, with what is left over and its covariance."""
         self.approach(observed, ends)
-        found = self.approach(observed, ends)
+        self.approach(observed, ends)
         points = self.points_mm()
-        moved = (self._control - self._start).ravel()
-        residuals = np.full((2, len(points)), np.nan)
-        normalized = []
-        for row, each in zip(residuals, found.seen, strict=True):
-            left_over = each.residual - each.rows @ moved
-            row[each.index[each.is_across]] = left_over[each.is_across]
-            normalized.append(left_over / each.sigma_px)
-        misfit = np.concatenate(normalized) ** 2
-        precision = np.concatenate([each.sigma_px**-2.0 for each in found.seen])
-        rms = float(np.sqrt(misfit.sum() / precision.sum()))
-        excess = max(1.0, float(misfit.mean()))
-        spread = _solved(found.normal, np.eye(len(found.normal)))
-        covariance = excess * spread
-        streak_misfits = [0.0 if line is None else line.misfit(points) for line in self._lines]
-        for (pull, at), contradiction in zip(found.pulls, streak_misfits, strict=True) if systematic_px > 0 else ():
-            alike = np.exp(-np.abs(at[:, None] - at) / self._parameters.systematic_mm)
-            # Where streak and silhouette contradict each other either may be wrong by as much.
-            alike *= max(1.0, contradiction) * systematic_px**2
-            gain = spread @ pull
-            covariance = covariance + gain @ alike @ gain.T
-        control = np.asarray(self._control, dtype=np.float64)
-        return CurveFit(self._u, control, np.asarray(covariance), points, residuals, rms, max(streak_misfits))
+        streak_misfits = [
+            0.0
+            if expected is None
+            else float(call("streak_misfit", view.sight, points, expected, np.empty(len(expected))))
+            for view, expected in zip(self._views, self._expected, strict=True)
+        ]
+        # Where streak and silhouette contradict each other either may be wrong by as much.
+        systematic = np.array([max(1.0, contradiction) * systematic_px**2 for contradiction in streak_misfits])
+        n, m = len(points), self.basis.control_points
+        residuals, rms, covariance = np.empty((2, n)), np.empty(1), np.empty((3 * m, 3 * m))
+        failed = call(
+            "fit_covariance",
+            self._sights,
+            n,
+            m,
+            self.basis.first,
+            self._start,
+            self._control,
+            self._normal,
+            self._length,
+            systematic,
+            self._parameters.systematic_mm,
+            residuals,
+            rms,
+            covariance,
+            np.empty(4 * 9 * m * m),
+        )
+        if failed:
+            raise NeedleNotFound("fit", Reason.HIGH_UNCERTAINTY)
+        return CurveFit(
+            self.parameters, self._control.copy(), covariance, points, residuals, float(rms[0]), max(streak_misfits)
+        )
 
+    def _streak_line(self, view: "_View", streak: StreakObservation) -> Float:
+        """Adds a streak to what a view measures; returns what is expected of it, a Cholesky factor (K, K).
 
-@dataclass(frozen=True, slots=True)
-class _Measured:
-    """What one view measures at K points: index (K,), whether across the curve or along it, sigma_px and weight (K,).
-
-    residual (K,) px, rows (K, 3M): offsets of the start of the curve, and their derivatives by its control points.
-    """
-
-    index: npt.NDArray[np.int64]
-    is_across: npt.NDArray[np.bool_]
-    sigma_px: Float
-    weight: Float
-    residual: Float
-    rows: Float
-
-
-@dataclass(frozen=True, slots=True)
-class _Approach:
-    """What both views measure, the normal matrix (3M, 3M), and what pulls (3M, K) each view at which lengths (K,)."""
-
-    seen: list[_Measured]
-    normal: Float
-    pulls: list[tuple[Float, Float]]
+        The streak runs beside the axis, at a distance that nobody knows but that changes slowly: a Gaussian process
+        along the needle, integrated out. What is left are offsets with correlated noise.
+        """
+        parameters = self._parameters
+        index = np.flatnonzero(np.isfinite(streak.sigma_px))
+        at, along = self._length[index], tangents(self._points_mm)[index]
+        # Neighbouring sections blur into one another as those of the silhouette do.
+        variance = streak.sigma_px[index] ** 2 * max(
+            1.0, parameters.correlation_mm * len(at) / max(np.ptp(self._length), 1e-9)
+        )
+        view.run_beside(index, streak.offset_px[index])
+        expected = np.empty((len(index), len(index)))
+        m = self.basis.control_points
+        failed = call(
+            "streak_line",
+            view.sight,
+            self._points_mm,
+            self.basis.first,
+            self.basis.mixing,
+            m,
+            at,
+            along,
+            variance,
+            streak.radius_px,
+            np.array([parameters.streak_share, parameters.streak_change_share, parameters.streak_bend_share]),
+            parameters.streak_mm,
+            _ROBUST_SIGMAS,
+            expected,
+            np.empty((len(index) + 3 * m + 16) * len(index)),
+        )
+        if failed:
+            raise NeedleNotFound("fit", Reason.HIGH_UNCERTAINTY)
+        return expected
 
 
 class _View:
-    """One view's sections in undistorted pixels, ready for linearising."""
+    """What one view measures, in undistorted pixels, as the kernels take it."""
 
-    def __init__(self, camera: Camera, pose: RigidTransform, sections: Sections) -> None:
-        self._camera, self._pose, self._sections = camera, pose, sections
-        self._here_px, self._ahead = self._undistorted(sections.center_px, sections.normal)
+    def __init__(self, sight: Sight, camera: Camera, lens: Float, sections: Sections, size: int) -> None:
+        self._camera, self._sections, self._size = camera, sections, size
+        self._arrays: dict[str, Float | Int] = {}
+        here, ahead = self._undistorted(sections.center_px, sections.normal)
+        room = len(here) + 2
+        self.sight = sight
+        sight.camera = self._kept("lens", lens)
+        sight.here_px, sight.ahead = self._kept("here", here), self._kept("ahead", ahead)
+        sight.index = self._kept("index", np.empty(room, np.int64))
+        sight.residual, sight.rows = self._kept("residual", np.empty(room)), self._kept("rows", np.empty((room, 12)))
+        sight.weight, sight.sigma = self._kept("weight", np.empty(room)), self._kept("sigma", np.empty(room))
 
-    def _undistorted(self, center_px: Float, direction: Float) -> tuple[Float, Float]:
-        """Undistorted places (K, 2), and what a raw pixel along the directions (K, 2) is there (K, 2)."""
-        # Over the few pixels of an offset the distortion is linear to 1e-4 px.
-        here, there = self._camera.undistort(np.concatenate([center_px, center_px + direction])).reshape(2, -1, 2)
-        return here, there - here
-
-    def measured(
-        self,
-        points_mm: Float,
-        observed: AcrossObservations,
-        ends: tuple[EndObservation, ...],
-        b: Float,
-        share: float,
-        moved: Float,
-    ) -> _Measured:
-        """What is observed of a curve that is now at points (N, 3), by the control points of which it moved (3M,)."""
-        across = np.flatnonzero(observed.seen)
-        residual, jacobian = self.linearized(points_mm, across, observed.offset_px)
-        index, sigma = across, observed.sigma_px[across]
+    def look_at(self, observed: AcrossObservations, ends: tuple[EndObservation, ...]) -> None:
+        """Measure these offsets, and these ends, from now on."""
+        sight = self.sight
+        sight.offset_px = self._kept("offset", np.ascontiguousarray(observed.offset_px))
+        sight.sigma_px = self._kept("sigma_px", np.ascontiguousarray(observed.sigma_px))
+        sight.ends = len(ends)
         if ends:
             at = np.array([end.index for end in ends], dtype=np.int64)
             normal = self._sections.normal[at]
@@ -364,96 +390,30 @@ class _View:
                 self._sections.center_px[at], np.column_stack([normal[:, 1], -normal[:, 0]])
             )
             shift = np.array([end.shift_px for end in ends])
-            end_residual, end_jacobian = self._by_points(points_mm[at], here + shift[:, None] * ahead, ahead)
-            index = np.concatenate([across, at])
-            sigma = np.concatenate([sigma, [end.sigma_px for end in ends]])
-            residual = np.concatenate([residual, end_residual])
-            jacobian = np.concatenate([jacobian, end_jacobian])
-        is_across = np.arange(len(index)) < len(across)
-        rows = _rows(b[index], jacobian)
-        weight = np.where(is_across, share, 1.0) / sigma**2
-        return _Measured(index, is_across, sigma, weight, residual + rows @ moved, rows)
+            sight.end_index = self._kept("end_index", at)
+            sight.end_here_px = self._kept("end_here", here + shift[:, None] * ahead)
+            sight.end_ahead = self._kept("end_ahead", ahead)
+            sight.end_sigma_px = self._kept("end_sigma", np.array([end.sigma_px for end in ends]))
 
-    def linearized(self, points_mm: Float, index: npt.NDArray[np.int64], offset_px: Float) -> tuple[Float, Float]:
-        """Offsets (K,) px that a curve (N, 3) misses at sections index (K,), and derivatives (K, 3) by its points."""
-        ahead = self._ahead[index]
-        return self._by_points(points_mm[index], self._here_px[index] + offset_px[index, None] * ahead, ahead)
+    def run_beside(self, index: Int, offset_px: Float) -> None:
+        """Measure a streak at sections index (K,), offset_px (K,) along them, as well."""
+        sight = self.sight
+        sight.lines = len(index)
+        sight.line_index = self._kept("line_index", index)
+        sight.line_offset_px = self._kept("line_offset", offset_px)
+        sight.line_weighted = self._kept("line_weighted", np.empty((len(index), self._size)))
+        sight.line_normal = self._kept("line_normal", np.empty((self._size, self._size)))
 
-    def _by_points(self, points_mm: Float, target_px: Float, ahead: Float) -> tuple[Float, Float]:
-        normal = ahead / np.maximum(np.linalg.norm(ahead, axis=1, keepdims=True), 1e-12)
-        local = self._pose.apply(points_mm)
-        depth = local[:, 2:]
-        ray = local[:, :2] / depth
-        matrix = self._camera.matrix
-        residual = ((target_px - ray @ matrix[:2, :2].T - matrix[:2, 2]) * normal).sum(axis=1)
-        by_ray = normal * (matrix[[0, 1], [0, 1]] / depth)
-        by_local = np.concatenate([by_ray, -(by_ray * ray).sum(axis=1, keepdims=True)], axis=1)
-        return np.asarray(residual), np.asarray(by_local @ self._pose.rotation)
+    def _kept(self, name: str, array: Float | Int) -> int | None:
+        # The kernels see addresses; the arrays must live as long.
+        self._arrays[name] = array
+        return address(array)
 
-
-class _Line:
-    """One view's streak: it runs beside the axis, at a distance that nobody knows but that changes slowly.
-
-    The distance is a Gaussian process along the needle, integrated out: what is left are offsets with correlated noise.
-    """
-
-    def __init__(
-        self,
-        view: _View,
-        streak: StreakObservation,
-        points_mm: Float,
-        length_mm: Float,
-        b: Float,
-        parameters: FitParameters,
-    ) -> None:
-        self._view, self._offset_px = view, streak.offset_px
-        self._index = np.flatnonzero(np.isfinite(streak.sigma_px))
-        at, along = length_mm[self._index], tangents(points_mm)[self._index]
-        slowly = parameters.streak_change_share**2 * _matern(np.abs(at[:, None] - at) / parameters.streak_mm)
-        alike = along @ along.T
-        bending = parameters.streak_bend_share**2 * _matern(np.sqrt(np.maximum(2 - 2 * alike, 0.0)))
-        distance = streak.radius_px**2 * (parameters.streak_share**2 + slowly + bending)
-        # Neighbouring sections blur into one another as those of the silhouette do.
-        variance = streak.sigma_px[self._index] ** 2 * max(
-            1.0, parameters.correlation_mm * len(at) / max(np.ptp(length_mm), 1e-9)
-        )
-        self._expected = distance + np.diag(variance)
-        residual, jacobian = view.linearized(points_mm, self._index, self._offset_px)
-        # What jumps off the line is not of it.
-        own = variance * np.linalg.solve(self._expected, residual)
-        jumping = variance * (1 + own**2 / (_ROBUST_SIGMAS**2 * variance))
-        rows = _rows(b[self._index], jacobian)
-        self._weighted = np.linalg.solve(distance + np.diag(jumping), rows).T
-        self._normal = self._weighted @ rows
-
-    def misfit(self, points_mm: Float) -> float:
-        """Mean squared offset left over about points (N, 3), in what was expected of a streak there."""
-        residual, _ = self._view.linearized(points_mm, self._index, self._offset_px)
-        return float(residual @ np.linalg.solve(self._expected, residual) / len(residual))
-
-    def normal(self, points_mm: Float, b: Float, moved: Float) -> tuple[Float, Float]:
-        """Normal matrix (3M, 3M), and the pull (3M,) on the start of a curve that is now at points (N, 3)."""
-        residual, _ = self._view.linearized(points_mm, self._index, self._offset_px)
-        return self._normal, self._weighted @ residual + self._normal @ moved
-
-
-def _rows(mixing: Float, jacobian: Float) -> Float:
-    """Derivatives (K, 3M) by control points from those by points (K, 3), of which mixing (K, M) says the shares."""
-    return np.asarray((mixing[:, :, None] * jacobian[:, None, :]).reshape(len(mixing), -1))
-
-
-def _matern(apart: Float) -> Float:
-    """Matern's covariance of order 3/2 at unit length (Rasmussen & Williams 2006, eq. 4.17)."""
-    scaled = np.sqrt(3) * apart
-    return np.asarray((1 + scaled) * np.exp(-scaled))
-
-
-def _solved(normal: Float, right: Float) -> Float:
-    """normal^-1 right; raises NeedleNotFound where the matrix is not positive definite."""
-    _, solution, info = dposv(normal, right)
-    if info != 0:
-        raise NeedleNotFound("fit", Reason.HIGH_UNCERTAINTY)
-    return np.asarray(solution, dtype=np.float64)
+    def _undistorted(self, center_px: Float, direction: Float) -> tuple[Float, Float]:
+        """Undistorted places (K, 2), and what a raw pixel along the directions (K, 2) is there (K, 2)."""
+        # Over the few pixels of an offset the distortion is linear to 1e-4 px.
+        here, there = self._camera.undistort(np.concatenate([center_px, center_px + direction])).reshape(2, -1, 2)
+        return here, there - here
 
 
 def _control_count(length_mm: float, parameters: FitParameters) -> int:
@@ -477,12 +437,17 @@ def _third_derivative_squared(count: int) -> Float:
     return np.asarray(np.kron(third.T @ third, np.eye(3)), dtype=np.float64)
 
 
-def _bend_matrix(u: Float, count: int, length_mm: float, after_s: float, parameters: FitParameters) -> Float:
+def _bend_matrix(points: int, count: int, length_mm: float, after_s: float, parameters: FitParameters) -> Float:
     """Prior on the change of the second derivative by arc length, which for a needle is that of its curvature."""
-    second = basis(u, count, derivative=2) / length_mm**2
     change_per_mm = parameters.curvature_motion_per_mm_s * after_s
-    weight = length_mm / len(u) / parameters.correlation_of_motion_mm / change_per_mm**2
-    return np.asarray(np.kron(weight * second.T @ second, np.eye(3)), dtype=np.float64)
+    weight = length_mm / points / parameters.correlation_of_motion_mm / change_per_mm**2
+    return _second_derivative_squared(points, count) * (weight / length_mm**4)
+
+
+@lru_cache(maxsize=256)
+def _second_derivative_squared(points: int, count: int) -> Float:
+    second = basis(np.linspace(0.0, 1.0, points), count, derivative=2)
+    return np.asarray(np.kron(second.T @ second, np.eye(3)), dtype=np.float64)
 
 
 def _prior_matrix(points_mm: Float, b: Float, length_mm: float, count: int, parameters: FitParameters) -> Float:

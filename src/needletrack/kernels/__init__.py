@@ -5,6 +5,6 @@ into `kernels-v3.so` for processors with AVX2 and FMA as well. Each function is 
 are C-contiguous. Calls release the interpreter's lock.
 """
 
-from needletrack.kernels.library import Array, Sight, address, call, packed_lens, two_sights
+from needletrack.kernels.library import Array, Sight, TipView, address, call, packed_lens, two_sights, two_tip_views
 
-__all__ = ["Array", "Sight", "address", "call", "packed_lens", "two_sights"]
+__all__ = ["Array", "Sight", "TipView", "address", "call", "packed_lens", "two_sights", "two_tip_views"]

@@ -6,23 +6,6 @@
 
 #define ROW 12
 
-/* What one view measures; as `fit._Sight` lays it out. Undistorted px. Outputs are marked. */
-typedef struct {
-  const Camera *camera;
-  const double *here_px, *ahead;          /* (n, 2) where each section was taken, and a raw pixel along it */
-  const double *offset_px, *sigma_px;     /* (n,) of the axis along it; infinite where not seen */
-  int64_t ends;                           /* ends that the view shows, at points end_index (ends,) */
-  const int64_t *end_index;
-  const double *end_here_px, *end_ahead, *end_sigma_px; /* (ends, 2), (ends, 2), (ends,) */
-  int64_t lines;                          /* sections line_index (lines,) that show a streak at line_offset_px */
-  const int64_t *line_index;
-  const double *line_offset_px;
-  double *line_weighted, *line_normal;    /* (lines, 3 m) and (3 m, 3 m) of `streak_line` */
-  int64_t count;                          /* out: how many of the following, which have room for n + ends */
-  int64_t *index;                         /* out: their points */
-  double *residual, *rows, *weight, *sigma; /* out: offsets of the start, (12,) each, robust weights, sigmas */
-} Sight;
-
 /* Offset that a point misses along `ahead` from where it was seen, and its derivative (3,) by the point. */
 static double missed(const Camera *c, const double *p, double at_x, double at_y, const double *ahead, double *by) {
   double length = sqrt(ahead[0] * ahead[0] + ahead[1] * ahead[1]);
@@ -356,6 +339,68 @@ EXPORT void point_covariance(const double *covariance, int64_t m, const int64_t 
                    covariance[(3 * (first[i] + p) + a) * size + 3 * (first[i] + q) + b];
         out[9 * i + 3 * a + b] = sum;
       }
+}
+
+static void add_outer(double *matrix, int64_t size, int64_t at, const double *mixing, double weight) {
+  for (int a = 0; a < 4; a++)
+    for (int b = 0; b < 4; b++)
+      for (int k = 0; k < 3; k++) matrix[(at + 3 * a + k) * size + at + 3 * b + k] += weight * mixing[a] * mixing[b];
+}
+
+/* The control points (3 m,) nearest to points (n, 3), and the matrices (3 m, 3 m) of what is known beforehand.
+
+   priors = (curvature change 1/mm^2, curvature motion 1/(mm s), its correlation mm, noise's correlation mm, how far
+   the points may slide along the curve mm). smooth: of the change of curvature alone; held: that and all the rest.
+   bent_for_s: how long ago the needle was bent like the points; 0: it was not. work: room for 4 n + 4 m + m (m + 3).
+   Returns 1 where the points hold no curve. */
+EXPORT int start_of_fit(const double *points, const double *length_mm, int64_t n, int64_t m, const int64_t *first,
+                        const double *mixing, const double *priors, double bent_for_s, double *start, double *held,
+                        double *smooth, double *work) {
+  int64_t size = 3 * m;
+  double whole = length_mm[n - 1], *place = work, *values = place + n, *normal = values + 4 * (n > m ? n : m),
+         *target = normal + m * m;
+  int64_t at[512];
+  if (n > 512 || m > 512) return 1;
+  memset(normal, 0, (size_t)(m * (m + 3)) * sizeof *normal);
+  for (int64_t i = 0; i < n; i++)
+    for (int a = 0; a < 4; a++) {
+      for (int b = 0; b < 4; b++)
+        normal[(first[i] + a) * m + first[i] + b] += mixing[4 * i + a] * mixing[4 * i + b];
+      for (int k = 0; k < 3; k++) target[3 * (first[i] + a) + k] += mixing[4 * i + a] * points[3 * i + k];
+    }
+  /* Where the points are too few for so many control points these stay near one another. */
+  for (int64_t k = 0; k < m; k++) normal[k * m + k] += 1e-12;
+  if (factored(normal, m)) return 1;
+  forward_all(normal, m, target, 3);
+  backward_all(normal, m, target, 3);
+  memcpy(start, target, (size_t)size * sizeof *start);
+  memset(smooth, 0, (size_t)(size * size) * sizeof *smooth);
+  for (int64_t k = 0; k < m - 3; k++) place[k] = ((double)k + 0.5) / (double)(m - 3);
+  basis(place, m - 3, m, 3, at, values);
+  double change = priors[0] * whole * whole * whole;
+  for (int64_t k = 0; k < m - 3; k++) add_outer(smooth, size, 3 * at[k], values + 4 * k, 1 / (change * change));
+  memcpy(held, smooth, (size_t)(size * size) * sizeof *held);
+  if (bent_for_s > 0) {
+    double motion = priors[1] * bent_for_s, weight = whole / (double)n / priors[2] / (motion * motion);
+    for (int64_t i = 0; i < n; i++) place[i] = length_mm[i] / whole;
+    basis(place, n, m, 2, at, values);
+    weight /= whole * whole * whole * whole;
+    for (int64_t i = 0; i < n; i++) add_outer(held, size, 3 * at[i], values + 4 * i, weight);
+  }
+  double per_point = whole / (double)n / priors[3] / (priors[4] * priors[4]);
+  for (int64_t i = 0; i < n; i++) {
+    const double *a = points + 3 * (i > 0 ? i - 1 : 0), *b = points + 3 * (i + 1 < n ? i + 1 : n - 1);
+    double along[3] = {b[0] - a[0], b[1] - a[1], b[2] - a[2]}, row[ROW];
+    double length = sqrt(dot(along, along, 3));
+    for (int k = 0; k < 3; k++) along[k] /= length > 1e-300 ? length : 1e-300;
+    row_of(mixing + 4 * i, along, row);
+    for (int p = 0; p < ROW; p++)
+      for (int q = 0; q < ROW; q++)
+        held[(3 * first[i] + p) * size + 3 * first[i] + q] += per_point * row[p] * row[q];
+  }
+  /* Everything is held to a metre: never singular. */
+  for (int64_t k = 0; k < size; k++) held[k * size + k] += 1e-6;
+  return 0;
 }
 
 /* Values of the four basis functions (n, 4) of a clamped cubic B-spline of m control points on [0, 1] that are not 0 at

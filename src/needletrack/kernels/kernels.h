@@ -21,6 +21,33 @@ void distorted(const Camera *c, double x, double y, double *px, double *by_ray);
 /* The ray (x, y, 1) of a raw pixel. */
 void ray_of(const Camera *c, const double *px, double *ray);
 
+/* What one view measures; as `fit._Sight` lays it out. Undistorted px. Outputs are marked. */
+typedef struct {
+  const Camera *camera;
+  const double *here_px, *ahead;          /* (n, 2) where each section was taken, and a raw pixel along it */
+  const double *offset_px, *sigma_px;     /* (n,) of the axis along it; infinite where not seen */
+  int64_t ends;                           /* ends that the view shows, at points end_index (ends,) */
+  const int64_t *end_index;
+  const double *end_here_px, *end_ahead, *end_sigma_px; /* (ends, 2), (ends, 2), (ends,) */
+  int64_t lines;                          /* sections line_index (lines,) that show a streak at line_offset_px */
+  const int64_t *line_index;
+  const double *line_offset_px;
+  double *line_weighted, *line_normal;    /* (lines, 3 m) and (3 m, 3 m) of `streak_line` */
+  int64_t count;                          /* out: how many of the following, which have room for n + ends */
+  int64_t *index;                         /* out: their points */
+  double *residual, *rows, *weight, *sigma; /* out: offsets of the start, (12,) each, robust weights, sigmas */
+} Sight;
+
+/* One view of an end, and the pictures of each shape of end that is tried; as `tip._TipView` lays it out. */
+typedef struct {
+  const double *weight, *weighted, *fixed; /* (n, width), (8, n, width), (8, 8) of `tip_picture` */
+  double noise_gray;
+  int64_t parts;
+  const double *pictures[8];               /* (parts, distances, width) of each shape */
+  int64_t distances[8];
+  double before_mm[8];
+} TipView;
+
 /* e^x of single precision for x <= 0, to 1e-5 of itself; below -87 it is nearly 0. */
 static inline float exp_negative(float x) {
   x = x < -87.0f ? -87.0f : x;
@@ -76,7 +103,52 @@ static inline float log_one_plus_exp_negative(float d) {
   return 2.0f * z * (p * z2 + 1.0f);
 }
 
-/* Raw pixels (n, 2) of points (n, 3) in the camera's own frame. */
+/* The kernels themselves; each says beside its body what it does. */
 void project(const Camera *c, const double *points_mm, int64_t n, double *pixels);
+void straighten(const uint8_t *image, int64_t rows, int64_t columns, int64_t stride, const Camera *c,
+                const double *local_mm, int64_t n, const double *offsets, int64_t count, double unit_mm, double *px,
+                double *normal, float *gray);
+double noise(const float *strip, int64_t n, int64_t count, float *work);
+float selected(float *v, int64_t n, int64_t k);
+void cut_sections(const uint8_t *image, int64_t rows, int64_t columns, int64_t stride, const Camera *c,
+                  const double *local_mm, int64_t n, int64_t per, const double *offsets, int64_t count, double unit_mm,
+                  double least_gray, double per_noise, double *work, double *center, double *normal, double *values,
+                  double *px_per_unit, uint8_t *inside);
+void products(const double *sections, int64_t n, int64_t count, const double *whitener, float *out);
+void no_needle(const float *each, int64_t n, int64_t edges, double *out);
+void over_none(const float *both, const double *none, int64_t n, int64_t s, double *log, uint8_t *cluttered);
+void prepared(const double *log, int64_t n, int64_t s, const float *refine, int64_t f, double never, float outlier,
+              double *most, float *relative, float *likelihood);
+void sites(const double *most, const float *relative, const float *likelihood, int64_t n, double low, double step,
+           int64_t s, double fine_step, int64_t f, const double *expected_px, double spread, const double *px_per_unit,
+           const uint8_t *inside, const uint8_t *doubtful, double least_gain, double least_sigma, double used,
+           double clutter_factor, double *offset_px, double *sigma_px, double *support);
+void best_path(double *worth, int64_t n, int64_t s, double price, int64_t *path);
+void best_motion(const double *log, int64_t n, int64_t s, const double *drifts, int64_t d, double step,
+                 double motion_price, double floor_log, double *shift);
+void basis(const double *u, int64_t n, int64_t m, int64_t derivative, int64_t *first, double *mixing);
+void curve(const double *control, const int64_t *first, const double *mixing, int64_t n, double *points);
+int approach(Sight *sights, int64_t n, int64_t m, const int64_t *first, const double *mixing, const double *start,
+             double *control, const double *held, const double *smooth, double share, double robust_px, int64_t rounds,
+             double *normal, double *work);
+int fit_covariance(const Sight *sights, int64_t n, int64_t m, const int64_t *first, const double *start,
+                   const double *control, const double *normal, const double *length_mm, const double *systematic,
+                   double systematic_mm, double *residual_px, double *rms_px, double *covariance, double *work);
+int streak_line(const Sight *s, const double *points, const int64_t *first, const double *mixing, int64_t m,
+                const double *at_mm, const double *along, const double *variance, double radius_px,
+                const double *shares, double change_mm, double robust, double *expected, double *work);
+double streak_misfit(const Sight *s, const double *points, const double *expected, double *work);
+int start_of_fit(const double *points, const double *length_mm, int64_t n, int64_t m, const int64_t *first,
+                 const double *mixing, const double *priors, double bent_for_s, double *start, double *held,
+                 double *smooth, double *work);
+int64_t find_streak(const double *values, int64_t n, int64_t count, const double *line, int64_t length, double low,
+                    double step, const double *half_widths, const double *axis, const double *rules, double *offset,
+                    double *sigma, double *work);
+double tip_picture(const uint8_t *image, int64_t rows, int64_t columns, int64_t stride, const Camera *c,
+                   const double *local_mm, const double *arc_mm, int64_t n, const double *across, int64_t width,
+                   double unit_mm, double reach, const double *rules, double *gray, double *weight, double *weighted,
+                   double *fixed, double *noise_gray, double *work);
+int find_tip(const TipView *views, int64_t shapes, const double *arc_mm, int64_t n, int64_t width, double picture_mm,
+             const double *prior, double log_prior, double end_mm, const double *rules, double *out, double *work);
 
 #endif

@@ -27,7 +27,8 @@ def load(path: Path) -> ctypes.CDLL:
         ) from error
     # An item of a library is a new function each time; an attribute is kept.
     library.streak_misfit.restype = ctypes.c_double
-    library.best_lag.restype = ctypes.c_int64
+    library.tip_picture.restype = ctypes.c_double
+    library.find_streak.restype = ctypes.c_int64
     return library
 
 
@@ -113,3 +114,26 @@ class Sight(ctypes.Structure):
 def two_sights() -> ctypes.Array[Sight]:
     """Room for what the left and the right view measure; the arrays they point to are kept alive by the caller."""
     return (Sight * 2)()
+
+
+MOST_SHAPES = 8
+
+
+class TipView(ctypes.Structure):
+    """One view of an end, and pictures of the shapes of end that are tried, as `kernels.h` lays it out."""
+
+    _fields_: Sequence[tuple[str, Any]] = [
+        ("weight", ctypes.c_void_p),
+        ("weighted", ctypes.c_void_p),
+        ("fixed", ctypes.c_void_p),
+        ("noise_gray", ctypes.c_double),
+        ("parts", ctypes.c_int64),
+        ("pictures", ctypes.c_void_p * MOST_SHAPES),
+        ("distances", ctypes.c_int64 * MOST_SHAPES),
+        ("before_mm", ctypes.c_double * MOST_SHAPES),
+    ]
+
+
+def two_tip_views() -> ctypes.Array[TipView]:
+    """Room for the left and the right view of an end; the arrays they point to are kept alive by the caller."""
+    return (TipView * 2)()

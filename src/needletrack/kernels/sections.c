@@ -65,7 +65,8 @@ EXPORT void straighten(const uint8_t *image, int64_t rows, int64_t columns, int6
   }
 }
 
-static float selected(float *v, int64_t n, int64_t k) {
+/* The value that is the k-th of n in order; v is partly sorted. */
+float selected(float *v, int64_t n, int64_t k) {
   int64_t low = 0, high = n - 1;
   while (low < high) {
     float pivot = v[(low + high) / 2];

@@ -7,7 +7,7 @@
 #define MOST 32
 
 /* Least of the mean squared differences of two profiles (n,), the other shifted by up to `most` rows, with its price. */
-EXPORT int64_t best_lag(const double *one, const double *other, int64_t n, int64_t most, double price) {
+static int64_t best_lag(const double *one, const double *other, int64_t n, int64_t most, double price) {
   int64_t best = 0;
   double least = INFINITY;
   for (int64_t lag = -most; lag <= most; lag++) {
@@ -32,7 +32,7 @@ static double between(const double *v, int64_t n, double at) {
 
 /* The picture (n, count) between columns left and right replaced by the profiles there, shifted along from one to the
    other by `lag` rows. share (count,): how far each column lies on the way. */
-EXPORT void filled(double *picture, int64_t n, int64_t count, int64_t left, int64_t right, int64_t lag,
+static void filled(double *picture, int64_t n, int64_t count, int64_t left, int64_t right, int64_t lag,
                    const double *share, const double *one, const double *other) {
   for (int64_t i = 0; i < n; i++)
     for (int64_t k = left + 1; k < right; k++) {
@@ -68,7 +68,7 @@ static void add_row(const double *inside, int64_t step, int64_t parts, const uin
    apex; before and beyond as the outermost. weight (n, width); weighted (8, n, width): planes and grey, weighted;
    fixed (8, 8): their products; prior (7 + parts,)^2; arc_mm (n,) of the rows, ascending. work: room for
    (n + 1) * parts * (8 + parts). Returns 1 where it fails. */
-EXPORT int misfits(const double *at_mm, int64_t apexes, const double *arc_mm, int64_t n, int64_t width,
+static int misfits(const double *at_mm, int64_t apexes, const double *arc_mm, int64_t n, int64_t width,
                    const double *pictures, int64_t parts, int64_t s, double before_mm, double picture_mm,
                    const double *weight, const double *weighted, const double *fixed, const double *prior, double *work,
                    double *out) {
@@ -123,4 +123,260 @@ EXPORT int misfits(const double *at_mm, int64_t apexes, const double *arc_mm, in
   }
   free(there);
   return failed;
+}
+
+/* Gaussian blur (n, width), mirrored at the borders as SciPy's `reflect`, to four sigmas. */
+static void blurred(const double *in, int64_t n, int64_t width, const double *sigma, double *out, double *work) {
+  for (int axis = 0; axis < 2; axis++) {
+    const double *from = axis ? work : in;
+    double *to = axis ? out : work, kernel[64], sum = 0;
+    int64_t radius = (int64_t)(4 * sigma[axis] + 0.5), length = axis ? width : n;
+    radius = radius > 31 ? 31 : radius;
+    for (int64_t k = -radius; k <= radius; k++)
+      sum += kernel[k + radius] = exp(-0.5 * (double)(k * k) / (sigma[axis] * sigma[axis]));
+    memset(to, 0, (size_t)(n * width) * sizeof *to);
+    for (int64_t i = 0; i < n; i++)
+      for (int64_t k = -radius; k <= radius; k++) {
+        double share = kernel[k + radius] / sum;
+        if (axis == 0) {
+          int64_t at = i + k;
+          while (at < 0 || at >= length) at = at < 0 ? -at - 1 : 2 * length - 1 - at;
+          for (int64_t j = 0; j < width; j++) to[i * width + j] += share * from[at * width + j];
+        } else {
+          for (int64_t j = 0; j < width; j++) {
+            int64_t at = j + k;
+            while (at < 0 || at >= length) at = at < 0 ? -at - 1 : 2 * length - 1 - at;
+            to[i * width + j] += share * from[i * width + at];
+          }
+        }
+      }
+  }
+}
+
+static double median_of(const double *v, int64_t n, double *work) {
+  float *copy = (float *)work;
+  for (int64_t i = 0; i < n; i++) copy[i] = (float)v[i];
+  double high = selected(copy, n, n / 2);
+  return n % 2 ? high : (high + selected(copy, n, n / 2 - 1)) / 2;
+}
+
+/* One view straightened past an end, of rows local_mm (n, 3) in the camera's frame at arc_mm (n,), across (width,).
+
+   See `tip._Picture`: gray, weight (n, width), weighted (8, n, width), fixed (8, 8), noise_gray; returns the median sine
+   of the angle to the line of sight. reach: how far the needle reaches to either side, units. rules = (saturated grey,
+   margin px, most lag, price of lag, least noise, sigma along, sigma across). work: room for 4 n width + 16 n. */
+EXPORT double tip_picture(const uint8_t *image, int64_t rows, int64_t columns, int64_t stride, const Camera *c,
+                          const double *local_mm, const double *arc_mm, int64_t n, const double *across, int64_t width,
+                          double unit_mm, double reach, const double *rules, double *gray, double *weight,
+                          double *weighted, double *fixed, double *noise_gray, double *work) {
+  int64_t plane = n * width;
+  double *px = work, *normal = px + 2 * n, *toward = normal + 2 * n, *one = toward + n, *other = one + n,
+         *spare = other + n, *share = spare + n;
+  double *smooth = work + 16 * n;
+  float *strip = (float *)(smooth + plane);
+  straighten(image, rows, columns, stride, c, local_mm, n, across, width, unit_mm, px, normal, strip);
+  double level = noise(strip, n, width, (float *)(smooth + 2 * plane));
+  *noise_gray = level > rules[4] ? level : rules[4];
+  for (int64_t i = 0; i < n; i++) {
+    const double *p = local_mm + 3 * i, *a = local_mm + 3 * (i > 0 ? i - 1 : 0),
+                 *b = local_mm + 3 * (i + 1 < n ? i + 1 : n - 1);
+    double along[3] = {b[0] - a[0], b[1] - a[1], b[2] - a[2]};
+    double length = sqrt(dot(along, along, 3) * dot(p, p, 3));
+    toward[i] = fabs(dot(along, p, 3)) / (length > 1e-300 ? length : 1e-300);
+    int inside = px[2 * i] >= rules[1] && px[2 * i + 1] >= rules[1] &&
+                 px[2 * i] <= (double)columns - 1 - rules[1] && px[2 * i + 1] <= (double)rows - 1 - rules[1];
+    for (int64_t k = 0; k < width; k++) {
+      double g = strip[i * width + k];
+      gray[i * width + k] = g;
+      weight[i * width + k] = inside && g < rules[0];
+    }
+  }
+  double middle = median_of(toward, n, spare), sine = 1 - middle * middle;
+  sine = sqrt(sine > 0 ? sine : 0);
+  /* What is behind: as it is beside. */
+  blurred(gray, n, width, rules + 5, smooth, smooth + plane);
+  double last = across[width - 1], beyond = reach < last - 0.75 ? reach : last - 0.75;
+  int64_t left = 0, right = width - 1;
+  for (int64_t k = 0; k < width; k++)
+    if (fabs(across[k]) > beyond) {
+      if (across[k] < 0) left = k;
+      else if (k < right) right = k;
+    }
+  for (int64_t k = 0; k < width && k < 11 * n; k++) {
+    double t = (across[k] - across[left]) / (across[right] - across[left]);
+    share[k] = t < 0 ? 0 : t > 1 ? 1 : t;
+  }
+  for (int64_t i = 0; i < n; i++) one[i] = smooth[i * width + left], other[i] = smooth[i * width + right];
+  filled(smooth, n, width, left, right, best_lag(one, other, n, (int64_t)rules[2], rules[3]), share, one, other);
+  double behind = median_of(smooth, plane, smooth + plane), all = median_of(gray, plane, smooth + plane);
+  double mean = 0;
+  for (int64_t i = 0; i < n; i++) mean += arc_mm[i] / (double)n;
+  double half = (arc_mm[n - 1] - arc_mm[0]) / 2;
+  double sums[8][8] = {{0}};
+  for (int64_t i = 0; i < n; i++) {
+    double s = (arc_mm[i] - mean) / half;
+    for (int64_t k = 0; k < width; k++) {
+      int64_t at = i * width + k;
+      double x = across[k] / last, w = weight[at];
+      double v[8] = {1, x, s, x * s, x * x, s * s, smooth[at] - behind, gray[at] - all};
+      for (int p = 0; p < 8; p++) weighted[p * plane + at] = w * v[p];
+      for (int p = 0; p < 8; p++)
+        for (int q = 0; q <= p; q++) sums[p][q] += w * v[p] * v[q];
+    }
+  }
+  for (int p = 0; p < 8; p++)
+    for (int q = 0; q < 8; q++) fixed[8 * p + q] = p >= q ? sums[p][q] : sums[q][p];
+  return sine;
+}
+
+/* Where the parabola through the lowest of evenly spaced values and its neighbours is lowest. */
+static double lowest(const double *at, const double *cost, int64_t n) {
+  int64_t i = 0;
+  for (int64_t k = 1; k < n; k++) i = cost[k] < cost[i] ? k : i;
+  i = i < 1 ? 1 : i > n - 2 ? n - 2 : i;
+  double bend = cost[i - 1] - 2 * cost[i] + cost[i + 1], shift = 0;
+  if (bend > 0) shift = (cost[i - 1] - cost[i + 1]) / (2 * bend);
+  shift = shift < -1 ? -1 : shift > 1 ? 1 : shift;
+  return at[i] + shift * (at[1] - at[0]);
+}
+
+/* Standard deviation of the place whose negative log likelihoods these are. */
+static double width_of(const double *at, const double *cost, int64_t n) {
+  double least = INFINITY, sum = 0, mean = 0, square = 0;
+  for (int64_t k = 0; k < n; k++) least = cost[k] < least ? cost[k] : least;
+  for (int64_t k = 0; k < n; k++) {
+    double w = exp(least - cost[k]);
+    sum += w, mean += w * at[k];
+  }
+  mean /= sum;
+  for (int64_t k = 0; k < n; k++) square += exp(least - cost[k]) * (at[k] - mean) * (at[k] - mean);
+  return sqrt(square / sum);
+}
+
+/* Negative log evidence (t,) of an apex from that of each view (2, t), which may be a little off each other. */
+static void together(const double *at, const double *cost, int64_t t, double sigma, double *out) {
+  for (int64_t i = 0; i < t; i++) out[i] = 0;
+  for (int v = 0; v < 2; v++)
+    for (int64_t i = 0; i < t; i++) {
+      double least = INFINITY;
+      for (int64_t k = 0; k < t; k++) {
+        double off = (at[i] - at[k]) / sigma, value = cost[v * t + k] + 0.5 * off * off;
+        least = value < least ? value : least;
+      }
+      out[i] += least;
+    }
+}
+
+#define MOST_SHAPES 8
+#define MOST_PLACES 64
+
+/* The apex on rows at arc_mm (n,) about end_mm: see `tip.find_tip`.
+
+   rules = (first and last apex tried from end_mm, coarse and fine step, how far the fine one reaches, what neighbouring
+   samples share, sigma between the views, least noise, where the end was expected from end_mm and its sigma, least
+   sigma, log evidence that makes a rival). prior, log_prior: of the background's and inside's parts, grey^-2.
+   out = (at_mm, each_mm (2,), sigma_mm (2,), contrast (2,), the shape's number). work: room for
+   (n + 1) * 19 * 16 + 2 * (7 + 16)^2. Returns 1 where the picture shows nothing. */
+EXPORT int find_tip(const TipView *views, int64_t shapes, const double *arc_mm, int64_t n, int64_t width,
+                    double picture_mm, const double *prior, double log_prior, double end_mm, const double *rules,
+                    double *out, double *work) {
+  double coarse[MOST_PLACES], near[MOST_SHAPES][MOST_PLACES], found[MOST_SHAPES][2][2 * MOST_PLACES];
+  double cost[MOST_SHAPES][2 * MOST_PLACES], both[MOST_SHAPES][MOST_PLACES], scale[2] = {INFINITY, INFINITY},
+         samples[2] = {0, 0}, rough[2][2 * MOST_PLACES];
+  int64_t tries = (int64_t)floor((rules[1] + rules[2] / 2 - rules[0]) / rules[2]) + 1,
+          fine = 2 * (int64_t)floor(rules[4] / rules[3] + 0.5) + 1;
+  if (tries > MOST_PLACES || fine > MOST_PLACES || shapes > MOST_SHAPES) return 1;
+  for (int64_t k = 0; k < tries; k++) coarse[k] = end_mm + rules[0] + rules[2] * (double)k;
+  double *scaled[2], log_priors[2];
+  for (int v = 0; v < 2; v++) {
+    int64_t size = PLANES + views[v].parts;
+    double unit = views[v].noise_gray * views[v].noise_gray * rules[5];
+    scaled[v] = work + v * size * size;
+    for (int64_t k = 0; k < size * size; k++) scaled[v][k] = prior[k] * unit;
+    log_priors[v] = log_prior + (double)size * log(unit);
+    for (int64_t k = 0; k < n * width; k++) samples[v] += views[v].weight[k];
+    samples[v] = samples[v] > 1 ? samples[v] : 1;
+  }
+  work += 2 * (PLANES + views[0].parts) * (PLANES + views[0].parts);
+  double foreseen = end_mm + rules[8];
+  for (int64_t shape = 0; shape < shapes; shape++) {
+    for (int pass = 0; pass < 2; pass++) {
+      int64_t count = pass ? fine : tries;
+      const double *at = pass ? near[shape] : coarse;
+      for (int v = 0; v < 2; v++) {
+        const TipView *view = views + v;
+        double *into = pass ? found[shape][v] : rough[v];
+        if (misfits(at, count, arc_mm, n, width, view->pictures[shape], view->parts, view->distances[shape],
+                    view->before_mm[shape], picture_mm, view->weight, view->weighted, view->fixed, scaled[v], work,
+                    into))
+          return 1;
+        for (int64_t k = 0; k < count; k++) into[2 * k + 1] -= log_priors[v];
+        double least = INFINITY;
+        for (int64_t k = 0; k < count; k++) least = into[2 * k] < least ? into[2 * k] : least;
+        if (pass) {
+          /* The scale of what is left over is each view's own: that of its best fit. */
+          scale[v] = least / samples[v] < scale[v] ? least / samples[v] : scale[v];
+          continue;
+        }
+        double unit = least / samples[v];
+        unit = unit > rules[7] * rules[7] ? unit : rules[7] * rules[7];
+        for (int64_t k = 0; k < count; k++)
+          cost[shape][v * count + k] = into[2 * k] / unit / 2 / rules[5] + into[2 * k + 1] / 2;
+      }
+      if (pass) continue;
+      together(coarse, cost[shape], tries, rules[6], both[shape]);
+      int64_t best = 0;
+      double least = INFINITY;
+      for (int64_t k = 0; k < tries; k++) {
+        double off = (coarse[k] - foreseen) / rules[9], value = both[shape][k] + 0.5 * off * off;
+        if (value < least) least = value, best = k;
+      }
+      for (int64_t k = 0; k < fine; k++)
+        near[shape][k] = coarse[best] + rules[3] * ((double)k - (double)(fine - 1) / 2);
+    }
+  }
+  int64_t chosen = 0;
+  double least[MOST_SHAPES];
+  for (int v = 0; v < 2; v++) {
+    double quiet = views[v].noise_gray * views[v].noise_gray;
+    scale[v] = scale[v] > quiet ? scale[v] : quiet;
+  }
+  for (int64_t shape = 0; shape < shapes; shape++) {
+    for (int v = 0; v < 2; v++)
+      for (int64_t k = 0; k < fine; k++)
+        cost[shape][v * fine + k] =
+            found[shape][v][2 * k] / scale[v] / 2 / rules[5] + found[shape][v][2 * k + 1] / 2;
+    together(near[shape], cost[shape], fine, rules[6], both[shape]);
+    least[shape] = INFINITY;
+    for (int64_t k = 0; k < fine; k++) {
+      double off = (near[shape][k] - foreseen) / rules[9];
+      both[shape][k] += 0.5 * off * off;
+      least[shape] = both[shape][k] < least[shape] ? both[shape][k] : least[shape];
+    }
+    if (least[shape] < least[chosen]) chosen = shape;
+  }
+  out[0] = lowest(near[chosen], both[chosen], fine);
+  for (int v = 0; v < 2; v++) {
+    const TipView *view = views + v;
+    out[1 + v] = lowest(near[chosen], cost[chosen] + v * fine, fine);
+    double sigma = width_of(near[chosen], cost[chosen] + v * fine, fine);
+    out[3 + v] = sigma > rules[10] ? sigma : rules[10];
+    /* Of a needle that goes on, and of none. */
+    double ends[2] = {arc_mm[n - 1] + 4, arc_mm[0] - 2}, others[4], best = INFINITY;
+    if (misfits(ends, 2, arc_mm, n, width, view->pictures[chosen], view->parts, view->distances[chosen],
+                view->before_mm[chosen], picture_mm, view->weight, view->weighted, view->fixed, scaled[v], work,
+                others))
+      return 1;
+    for (int64_t k = 0; k < fine; k++) best = found[chosen][v][2 * k] < best ? found[chosen][v][2 * k] : best;
+    double better = ((others[0] < others[2] ? others[0] : others[2]) - best) / scale[v] / rules[5];
+    out[5 + v] = sqrt(better > 0 ? better : 0);
+  }
+  /* Another shape of end that explains the pictures nearly as well would put the apex elsewhere. */
+  for (int64_t shape = 0; shape < shapes; shape++)
+    if (shape != chosen && least[shape] - least[chosen] < rules[11]) {
+      double off = (lowest(near[shape], both[shape], fine) - out[0]) / 2;
+      for (int v = 0; v < 2; v++) out[3 + v] = sqrt(out[3 + v] * out[3 + v] + off * off);
+    }
+  out[7] = (double)chosen;
+  return 0;
 }

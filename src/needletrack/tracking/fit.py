@@ -26,6 +26,8 @@ from needletrack.tracking.needle import Positive
 _SKELETON_SIGMA_MM = 0.3
 # Sigmas by which a streak's places may be off its line before they count for less.
 _ROBUST_SIGMAS = 2.0
+# Points of the curve may slide along it by so much.
+_ALONG_SIGMA_MM = 0.3
 # Robust weights settle in so many rounds.
 _ROUNDS = 2
 
@@ -219,22 +221,31 @@ class CurveFitting:
         whole = float(self._length[-1])
         count = _control_count(whole, parameters)
         self.basis = spline_basis(self._length / whole, count)
-        dense = self.basis.dense()
-        # Where the points are too few for so many control points these stay near one another.
-        normal = dense.T @ dense + 1e-12 * np.eye(count)
-        self._start = np.linalg.solve(normal, dense.T @ points_mm)
+        n, size = len(points_mm), 3 * count
+        self._start, self._held, self._smooth = np.empty((count, 3)), np.empty((size, size)), np.empty((size, size))
+        failed = call(
+            "start_of_fit",
+            self._points_mm,
+            self._length,
+            n,
+            count,
+            self.basis.first,
+            self.basis.mixing,
+            priors(parameters),
+            0.0 if bent_for_s is None else bent_for_s,
+            self._start,
+            self._held,
+            self._smooth,
+            np.empty(4 * n + 4 * max(n, count) + count * (count + 3)),
+        )
+        if failed:
+            raise NeedleNotFound("fit", Reason.HIGH_UNCERTAINTY)
         self._control = self._start.copy()
-        self._smooth = _smoothness_matrix(count, whole, parameters)
-        self._held = _prior_matrix(points_mm, dense, whole, count, parameters) + self._smooth
-        if bent_for_s is not None:
-            self._held += _bend_matrix(len(points_mm), count, whole, bent_for_s, parameters)
         self._share = min(1.0, whole / (len(points_mm) - 1) / parameters.correlation_mm)
         self._sights = two_sights()
         self._views = [
             _View(sight, camera, lens, each, size=3 * count)
-            for sight, camera, lens, each in zip(
-                self._sights, (rig.left, rig.right), rig.lenses, sections, strict=True
-            )
+            for sight, camera, lens, each in zip(self._sights, (rig.left, rig.right), rig.lenses, sections, strict=True)
         ]
         self._expected = [
             None if streak is None else self._streak_line(view, streak)
@@ -426,33 +437,18 @@ def _third_derivative(count: int) -> Float:
     return basis(middles, count, derivative=3)
 
 
-def _smoothness_matrix(count: int, length_mm: float, parameters: FitParameters) -> Float:
-    """Prior on the third derivative by arc length, which for a needle is the change of its curvature."""
-    return _third_derivative_squared(count) / (parameters.curvature_change_per_mm2 * length_mm**3) ** 2
+def priors(parameters: FitParameters) -> Float:
+    """What is known of a needle before it is looked at, as the kernel `start_of_fit` takes it.
 
-
-@lru_cache(maxsize=64)
-def _third_derivative_squared(count: int) -> Float:
-    third = _third_derivative(count)
-    return np.asarray(np.kron(third.T @ third, np.eye(3)), dtype=np.float64)
-
-
-def _bend_matrix(points: int, count: int, length_mm: float, after_s: float, parameters: FitParameters) -> Float:
-    """Prior on the change of the second derivative by arc length, which for a needle is that of its curvature."""
-    change_per_mm = parameters.curvature_motion_per_mm_s * after_s
-    weight = length_mm / points / parameters.correlation_of_motion_mm / change_per_mm**2
-    return _second_derivative_squared(points, count) * (weight / length_mm**4)
-
-
-@lru_cache(maxsize=256)
-def _second_derivative_squared(points: int, count: int) -> Float:
-    second = basis(np.linspace(0.0, 1.0, points), count, derivative=2)
-    return np.asarray(np.kron(second.T @ second, np.eye(3)), dtype=np.float64)
-
-
-def _prior_matrix(points_mm: Float, b: Float, length_mm: float, count: int, parameters: FitParameters) -> Float:
-    """Holds the points along the curve, where no view sees a motion, and everything to a metre: never singular."""
-    along = tangents(points_mm)
-    rows = (b[:, :, None] * along[:, None, :]).reshape(len(b), 3 * count)
-    per_point = length_mm / len(b) / parameters.correlation_mm
-    return np.asarray(per_point * rows.T @ rows / 0.3**2 + np.eye(3 * count) / 1000.0**2)
+    The third derivative by arc length is the change of its curvature, the second's change is that of its curvature
+    itself. The points are held along the curve, where no view sees a motion.
+    """
+    return np.array(
+        [
+            parameters.curvature_change_per_mm2,
+            parameters.curvature_motion_per_mm_s,
+            parameters.correlation_of_motion_mm,
+            parameters.correlation_mm,
+            _ALONG_SIGMA_MM,
+        ]
+    )

@@ -120,7 +120,7 @@ def cut_sections(image: Image, camera: Camera, local_mm: Float, needle: Needle) 
     values, scale, inside = np.empty((count, columns)), np.empty(count), np.empty(count, np.bool_)
     call(
         "cut_sections",
-        *_rows_of(image),
+        *rows_of(image),
         camera.lens,
         local,
         count,
@@ -147,7 +147,7 @@ def straightened(image: Image, camera: Camera, local_mm: Float, offsets: Float, 
     pixels, normal = np.empty((2, len(local), 2))
     call(
         "straighten",
-        *_rows_of(image),
+        *rows_of(image),
         camera.lens,
         local,
         len(local),
@@ -161,7 +161,7 @@ def straightened(image: Image, camera: Camera, local_mm: Float, offsets: Float, 
     return gray.astype(np.float64)
 
 
-def _rows_of(image: Image) -> tuple[Image, int, int, int]:
+def rows_of(image: Image) -> tuple[Image, int, int, int]:
     """An image as the kernels take it: its bytes, rows, columns, and bytes from row to row."""
     contiguous = np.ascontiguousarray(image)
     return contiguous, *contiguous.shape, contiguous.shape[1]

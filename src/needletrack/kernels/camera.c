@@ -65,8 +65,8 @@ EXPORT void normalize(const Camera *c, const double *pixels, int64_t n, double *
   for (int64_t i = 0; i < n; i++) ray_of(c, pixels + 2 * i, rays + 2 * i);
 }
 
-/* Whether this processor has what the library for x86-64-v3 needs. */
-EXPORT int has_v3(void) {
+/* Whether this processor has what the library for x86-64-v3 (System V psABI) needs. */
+EXPORT int has_x86_64_v3(void) {
 #if defined(__x86_64__)
   return __builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma") && __builtin_cpu_supports("bmi2");
 #else

@@ -98,9 +98,15 @@ EXPORT void prepared(const double *log, int64_t n, int64_t s, const float *refin
     for (int64_t k = 0; k < s; k++) mine[k] = exp_negative(low[k]);
     float highest = -INFINITY;
     for (int64_t j = 0; j < f; j++) {
-      const float *weights = refine + j * s;
+      /* A spline's weights fall off by 0.27 from sample to sample: eight to either side are all. */
+      int64_t taps = s < 16 ? s : 16, first = j * (s - 1) / (f - 1) - 7;
+      first = first < 0 ? 0 : first > s - taps ? s - taps : first;
+      const float *weights = refine + j * s + first, *near = low + first;
       float sum = 0;
-      for (int64_t k = 0; k < s; k++) sum += weights[k] * low[k];
+      if (taps == 16)
+        for (int k = 0; k < 16; k++) sum += weights[k] * near[k];
+      else
+        for (int64_t k = 0; k < taps; k++) sum += weights[k] * near[k];
       curve[j] = sum;
     }
     for (int64_t j = 0; j < f; j++) highest = curve[j] > highest ? curve[j] : highest;

@@ -359,8 +359,7 @@ EXPORT int start_of_fit(const double *points, const double *length_mm, int64_t n
   int64_t size = 3 * m;
   double whole = length_mm[n - 1], *place = work, *values = place + n, *normal = values + 4 * (n > m ? n : m),
          *target = normal + m * m;
-  int64_t at[512];
-  if (n > 512 || m > 512) return 1;
+  int64_t at[n > m ? n : m];
   memset(normal, 0, (size_t)(m * (m + 3)) * sizeof *normal);
   for (int64_t i = 0; i < n; i++)
     for (int a = 0; a < 4; a++) {

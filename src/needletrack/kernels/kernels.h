@@ -43,7 +43,8 @@ typedef struct {
   const double *weight, *weighted, *fixed; /* (n, width), (8, n, width), (8, 8) of `tip_picture` */
   double noise_gray;
   int64_t parts;
-  const double *pictures[8];               /* (parts, distances, width) of each shape */
+  const double *pictures[8], *own[8];      /* (distances, parts, width) of each shape, and of `pictures_of` ... */
+  const uint8_t *there[8];                 /* ... (distances, parts, parts) and (distances, parts) */
   int64_t distances[8];
   double before_mm[8];
 } TipView;

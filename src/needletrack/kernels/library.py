@@ -34,7 +34,7 @@ def load(path: Path) -> ctypes.CDLL:
 
 def best_library() -> Path:
     """The library for this machine's processor."""
-    return WITH_AVX2 if WITH_AVX2.exists() and load(BASELINE).has_v3() else BASELINE
+    return WITH_AVX2 if WITH_AVX2.exists() and load(BASELINE).has_x86_64_v3() else BASELINE
 
 
 _library = load(best_library())
@@ -129,6 +129,8 @@ class TipView(ctypes.Structure):
         ("noise_gray", ctypes.c_double),
         ("parts", ctypes.c_int64),
         ("pictures", ctypes.c_void_p * MOST_SHAPES),
+        ("own", ctypes.c_void_p * MOST_SHAPES),
+        ("there", ctypes.c_void_p * MOST_SHAPES),
         ("distances", ctypes.c_int64 * MOST_SHAPES),
         ("before_mm", ctypes.c_double * MOST_SHAPES),
     ]

@@ -12,23 +12,35 @@ static inline void cubic(float t, float *w) {
 
 static inline int64_t within(int64_t i, int64_t n) { return i < 0 ? 0 : i >= n ? n - 1 : i; }
 
+typedef float Four __attribute__((vector_size(16)));
+typedef uint8_t FourBytes __attribute__((vector_size(4)));
+
+static inline Four weights(float t) {
+  float w[4];
+  cubic(t, w);
+  return (Four){w[0], w[1], w[2], w[3]};
+}
+
 static inline float sampled(const uint8_t *image, int64_t rows, int64_t columns, int64_t stride, float x, float y) {
-  float fx = floorf(x), fy = floorf(y), wx[4], wy[4];
+  float fx = floorf(x), fy = floorf(y);
   int64_t ix = (int64_t)fx - 1, iy = (int64_t)fy - 1;
-  cubic(x - fx, wx);
-  cubic(y - fy, wy);
-  float sum = 0;
+  Four across = weights(x - fx), down = weights(y - fy), sum = {0, 0, 0, 0};
   if (ix >= 0 && iy >= 0 && ix + 4 <= columns && iy + 4 <= rows) {
     const uint8_t *at = image + iy * stride + ix;
-    for (int r = 0; r < 4; r++, at += stride)
-      sum += wy[r] * (wx[0] * at[0] + wx[1] * at[1] + wx[2] * at[2] + wx[3] * at[3]);
+    for (int r = 0; r < 4; r++, at += stride) {
+      FourBytes four;
+      memcpy(&four, at, sizeof four);
+      sum += down[r] * __builtin_convertvector(four, Four);
+    }
   } else {
     for (int r = 0; r < 4; r++) {
       const uint8_t *row = image + within(iy + r, rows) * stride;
-      for (int k = 0; k < 4; k++) sum += wy[r] * wx[k] * row[within(ix + k, columns)];
+      for (int k = 0; k < 4; k++) sum[k] += down[r] * (float)row[within(ix + k, columns)];
     }
   }
-  return sum < 0 ? 0 : sum > 255 ? 255 : sum;
+  sum *= across;
+  float gray = (sum[0] + sum[1]) + (sum[2] + sum[3]);
+  return gray < 0 ? 0 : gray > 255 ? 255 : gray;
 }
 
 /* Unit tangents (n, 2) of a polyline (n, 2) by central differences, turned by a quarter: its normals. */

@@ -1,6 +1,4 @@
 /* Ends of a needle tried in a straightened picture: see `tracking/tip.py`. */
-#include <stdlib.h>
-
 #include "kernels.h"
 
 #define PLANES 7
@@ -48,56 +46,88 @@ static double dot(const double *a, const double *b, int64_t n) {
   return sum;
 }
 
-/* Adds what one row of the picture that shows `inside` (parts, width) says: by planes and grey, and by itself. */
-static void add_row(const double *inside, int64_t step, int64_t parts, const uint8_t *is_there, const double *weighted,
-                    int64_t plane_step, const double *weight, int64_t width, double *mixed, double *own) {
-  double part[MOST];
+/* What is the same wherever the apex is, of the pictures of one shape of end: see `pictures_of`. */
+typedef struct {
+  const double *pictures, *own; /* (distances, parts, width), and the parts' products (distances, parts, parts) */
+  const uint8_t *there;         /* (distances, parts): whether a part shows there at all */
+} Shape;
+
+/* Adds what one row of the view, which shows row `at` of the pictures, says: by planes and grey, and by itself. */
+static void add_row(const Shape *shape, int64_t at, int64_t parts, const double *weighted, int64_t plane_step,
+                    const double *weight, int is_whole, int64_t width, double *mixed, double *own) {
+  const double *inside = shape->pictures + at * parts * width;
+  const uint8_t *there = shape->there + at * parts;
   for (int64_t p = 0; p < parts; p++) {
-    if (!is_there[p]) continue;
-    const double *mine = inside + p * step;
+    if (!there[p]) continue;
+    const double *mine = inside + p * width;
     for (int q = 0; q <= PLANES; q++) mixed[p * (PLANES + 1) + q] += dot(mine, weighted + q * plane_step, width);
-    for (int64_t k = 0; k < width; k++) part[k] = mine[k] * weight[k];
+  }
+  if (is_whole) {
+    const double *all = shape->own + at * parts * parts;
+    for (int64_t k = 0; k < parts * parts; k++) own[k] += all[k];
+    return;
+  }
+  double part[64];
+  for (int64_t p = 0; p < parts; p++) {
+    if (!there[p]) continue;
+    for (int64_t k = 0; k < width; k++) part[k] = inside[p * width + k] * weight[k];
     for (int64_t o = 0; o <= p; o++)
-      if (is_there[o]) own[p * parts + o] += dot(part, inside + o * step, width);
+      if (there[o]) own[p * parts + o] += dot(part, inside + o * width, width);
+  }
+}
+
+/* The parts' products (distances, parts, parts) in pictures (distances, parts, width), and whether each shows there. */
+EXPORT void pictures_of(const double *pictures, int64_t distances, int64_t parts, int64_t width, double *own,
+                        uint8_t *there) {
+  for (int64_t i = 0; i < distances; i++) {
+    const double *row = pictures + i * parts * width;
+    for (int64_t p = 0; p < parts; p++) {
+      there[i * parts + p] = 0;
+      for (int64_t k = 0; k < width; k++)
+        if (fabs(row[p * width + k]) > 1e-9) there[i * parts + p] = 1;
+      for (int64_t o = 0; o < parts; o++)
+        own[(i * parts + p) * parts + o] = dot(row + p * width, row + o * width, width);
+    }
   }
 }
 
 /* For apexes at_mm (apexes,): squared greys left over, and the log determinant of what the parts could show.
 
-   pictures (parts, s, width): of each part of the inside at distances before_mm + picture_mm * (0 ... s - 1) before the
-   apex; before and beyond as the outermost. weight (n, width); weighted (8, n, width): planes and grey, weighted;
-   fixed (8, 8): their products; prior (7 + parts,)^2; arc_mm (n,) of the rows, ascending. work: room for
-   (n + 1) * parts * (8 + parts). Returns 1 where it fails. */
+   The pictures show each part of the inside at distances before_mm + picture_mm * (0 ... s - 1) before the apex; before
+   and beyond all is as in the outermost. weight (n, width); weighted (8, n, width): planes and grey, weighted; fixed
+   (8, 8): their products; prior (7 + parts,)^2; arc_mm (n,) of the rows, ascending. work: room for
+   (n + 1) * parts * (8 + parts) + n. Returns 1 where it fails. */
 static int misfits(const double *at_mm, int64_t apexes, const double *arc_mm, int64_t n, int64_t width,
-                   const double *pictures, int64_t parts, int64_t s, double before_mm, double picture_mm,
+                   const Shape *shape, int64_t parts, int64_t s, double before_mm, double picture_mm,
                    const double *weight, const double *weighted, const double *fixed, const double *prior, double *work,
                    double *out) {
   int64_t each = parts * (PLANES + 1 + parts), size = PLANES + parts, plane = n * width;
-  uint8_t *there = calloc((size_t)(parts * s), 1);
-  if (!there) return 1;
-  for (int64_t row = 0; row < s; row++)
-    for (int64_t p = 0; p < parts; p++)
-      for (int64_t k = 0; k < width; k++)
-        if (fabs(pictures[(p * s + row) * width + k]) > 1e-9) there[row * parts + p] = 1;
+  uint8_t *whole = (uint8_t *)(work + (n + 1) * each);
+  for (int64_t r = 0; r < n; r++) {
+    whole[r] = 1;
+    for (int64_t k = 0; k < width; k++) whole[r] &= weight[r * width + k] == 1;
+  }
   /* Far from the apex all rows are alike: sums over the first r rows, all of them of the shaft. */
   memset(work, 0, (size_t)each * sizeof *work);
+  double farthest = -INFINITY;
+  for (int64_t a = 0; a < apexes; a++) farthest = at_mm[a] > farthest ? at_mm[a] : farthest;
   for (int64_t r = 0; r < n; r++) {
     double *sums = work + (r + 1) * each;
+    if ((int64_t)rint((farthest - arc_mm[r] - before_mm) / picture_mm) < s - 1) break;
     memcpy(sums, work + r * each, (size_t)each * sizeof *work);
-    add_row(pictures + (s - 1) * width, s * width, parts, there + (s - 1) * parts, weighted + r * width, plane,
-            weight + r * width, width, sums, sums + parts * (PLANES + 1));
+    add_row(shape, s - 1, parts, weighted + r * width, plane, weight + r * width, whole[r], width, sums,
+            sums + parts * (PLANES + 1));
   }
-  int failed = 0;
-  for (int64_t a = 0; a < apexes && !failed; a++) {
+  for (int64_t a = 0; a < apexes; a++) {
     double sums[MOST * (PLANES + 1 + MOST)], normal[(PLANES + MOST) * (PLANES + MOST)], target[PLANES + MOST];
     int64_t r = 0;
     while (r < n && (int64_t)rint((at_mm[a] - arc_mm[r] - before_mm) / picture_mm) >= s - 1) r++;
     memcpy(sums, work + r * each, (size_t)each * sizeof *sums);
     for (; r < n; r++) {
       int64_t row = (int64_t)rint((at_mm[a] - arc_mm[r] - before_mm) / picture_mm);
-      row = row < 0 ? 0 : row;
-      add_row(pictures + row * width, s * width, parts, there + row * parts, weighted + r * width, plane,
-              weight + r * width, width, sums, sums + parts * (PLANES + 1));
+      if (row < 0) break; /* Nothing of it shows from here on. */
+      add_row(shape, row, parts, weighted + r * width, plane, weight + r * width, whole[r], width, sums,
+              sums + parts * (PLANES + 1));
     }
     const double *own = sums + parts * (PLANES + 1);
     for (int64_t i = 0; i < size; i++) {
@@ -108,21 +138,22 @@ static int misfits(const double *at_mm, int64_t apexes, const double *arc_mm, in
       }
       target[i] = i < PLANES ? fixed[i * (PLANES + 1) + PLANES] : sums[(i - PLANES) * (PLANES + 1) + PLANES];
     }
-    double log_determinant = 0;
-    for (int64_t i = 0; i < size && !failed; i++) {
+    double determinant = 1, log_determinant = 0;
+    for (int64_t i = 0; i < size; i++) {
       double *mine = normal + i * size;
-      for (int64_t j = 0; j < i; j++) mine[j] = (mine[j] - dot(mine, normal + j * size, j)) / normal[j * size + j];
+      for (int64_t j = 0; j < i; j++) mine[j] = (mine[j] - dot(mine, normal + j * size, j)) * normal[j * size + j];
       double rest = mine[i] - dot(mine, mine, i);
-      if (!(rest > 0)) failed = 1;
-      mine[i] = sqrt(rest);
-      log_determinant += 2 * log(mine[i]);
-      target[i] = (target[i] - dot(mine, target, i)) / mine[i];
+      if (!(rest > 0)) return 1;
+      determinant *= rest;
+      if (determinant > 1e200 || determinant < 1e-200) log_determinant += log(determinant), determinant = 1;
+      /* The diagonal is kept as its inverse. */
+      mine[i] = 1 / sqrt(rest);
+      target[i] = (target[i] - dot(mine, target, i)) * mine[i];
     }
     out[2 * a] = fixed[PLANES * (PLANES + 1) + PLANES] - dot(target, target, size);
-    out[2 * a + 1] = log_determinant;
+    out[2 * a + 1] = log_determinant + log(determinant);
   }
-  free(there);
-  return failed;
+  return 0;
 }
 
 /* Gaussian blur (n, width), mirrored at the borders as SciPy's `reflect`, to four sigmas. */
@@ -276,7 +307,7 @@ static void together(const double *at, const double *cost, int64_t t, double sig
    samples share, sigma between the views, least noise, where the end was expected from end_mm and its sigma, least
    sigma, log evidence that makes a rival). prior, log_prior: of the background's and inside's parts, grey^-2.
    out = (at_mm, each_mm (2,), sigma_mm (2,), contrast (2,), the shape's number). work: room for
-   (n + 1) * 19 * 16 + 2 * (7 + 16)^2. Returns 1 where the picture shows nothing. */
+   (n + 1) * 19 * 16 + n + 2 * (7 + 16)^2. Returns 1 where the picture shows nothing. */
 EXPORT int find_tip(const TipView *views, int64_t shapes, const double *arc_mm, int64_t n, int64_t width,
                     double picture_mm, const double *prior, double log_prior, double end_mm, const double *rules,
                     double *out, double *work) {
@@ -288,6 +319,10 @@ EXPORT int find_tip(const TipView *views, int64_t shapes, const double *arc_mm, 
   if (tries > MOST_PLACES || fine > MOST_PLACES || shapes > MOST_SHAPES) return 1;
   for (int64_t k = 0; k < tries; k++) coarse[k] = end_mm + rules[0] + rules[2] * (double)k;
   double *scaled[2], log_priors[2];
+  Shape shapes_of[2][MOST_SHAPES];
+  for (int v = 0; v < 2; v++)
+    for (int64_t k = 0; k < shapes; k++)
+      shapes_of[v][k] = (Shape){views[v].pictures[k], views[v].own[k], views[v].there[k]};
   for (int v = 0; v < 2; v++) {
     int64_t size = PLANES + views[v].parts;
     double unit = views[v].noise_gray * views[v].noise_gray * rules[5];
@@ -306,7 +341,7 @@ EXPORT int find_tip(const TipView *views, int64_t shapes, const double *arc_mm, 
       for (int v = 0; v < 2; v++) {
         const TipView *view = views + v;
         double *into = pass ? found[shape][v] : rough[v];
-        if (misfits(at, count, arc_mm, n, width, view->pictures[shape], view->parts, view->distances[shape],
+        if (misfits(at, count, arc_mm, n, width, &shapes_of[v][shape], view->parts, view->distances[shape],
                     view->before_mm[shape], picture_mm, view->weight, view->weighted, view->fixed, scaled[v], work,
                     into))
           return 1;
@@ -363,7 +398,7 @@ EXPORT int find_tip(const TipView *views, int64_t shapes, const double *arc_mm, 
     out[3 + v] = sigma > rules[10] ? sigma : rules[10];
     /* Of a needle that goes on, and of none. */
     double ends[2] = {arc_mm[n - 1] + 4, arc_mm[0] - 2}, others[4], best = INFINITY;
-    if (misfits(ends, 2, arc_mm, n, width, view->pictures[chosen], view->parts, view->distances[chosen],
+    if (misfits(ends, 2, arc_mm, n, width, &shapes_of[v][chosen], view->parts, view->distances[chosen],
                 view->before_mm[chosen], picture_mm, view->weight, view->weighted, view->fixed, scaled[v], work,
                 others))
       return 1;

@@ -4,7 +4,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from needletrack.geometry.spline import arc_length, spline_basis
+from needletrack.geometry.spline import arc_length
 from needletrack.geometry.stereo import StereoRig
 from needletrack.records import Appearance, Float, Image, Int
 from needletrack.tracking.clipped import WHITE, WORTH_A_LOOK, Flanks, clipped_axis, clipped_share
@@ -53,7 +53,6 @@ class Adjusted:
     support: Float
     shines: Mask
     flanks: Flanks | None = None
-    fitting: CurveFitting | None = None
 
     def part(self, start: int, stop: int) -> "Adjusted":
         """The points start <= i < stop alone."""
@@ -76,43 +75,6 @@ class Adjusted:
             self.shines[:, cut],
             self.flanks,
         )
-
-
-def brought_to_end(
-    adjusted: Adjusted, at_mm: float, ends: Ends, spacing_mm: float, parameters: FitParameters
-) -> Adjusted:
-    """The adjusted curve fitted once more, to the ends that both views show as well, and cut there.
-
-    at_mm: the end along the curve. The curve reaches beyond it.
-    """
-    if adjusted.fitting is None:
-        raise ValueError("a curve that was cut cannot be fitted once more")
-    fit = adjusted.fitting.fit(adjusted.observed, ends, parameters.systematic_px[adjusted.appearance.inside])
-    arc = arc_length(fit.points_mm)
-    # The curve as fitted once more may be a little shorter than it was.
-    at_mm = min(at_mm, float(arc[-1]))
-    count = max(8, round(at_mm / spacing_mm) + 1)
-    cut = np.interp(np.linspace(0.0, at_mm, count), arc, fit.parameters)
-    # What was seen of a section is told of the point of the curve next to it.
-    nearest = np.abs(fit.parameters - cut[:, None]).argmin(axis=1)
-    nearest[-1] = ends[0][0].index
-    points = spline_basis(cut, len(fit.control_mm)).curve(fit.control_mm)
-    left, right = adjusted.observed
-    return Adjusted(
-        CurveFit(
-            cut,
-            fit.control_mm,
-            fit.covariance_mm2,
-            points,
-            fit.residual_px[:, nearest],
-            fit.rms_px,
-            fit.streak_misfit,
-        ),
-        (left.part(nearest), right.part(nearest)),
-        adjusted.appearance,
-        adjusted.support[:, nearest],
-        adjusted.shines[:, nearest],
-    )
 
 
 def adjust(
@@ -191,7 +153,7 @@ def adjust(
     expected = across(fit.points_mm)
     _, support = look(expected, looks.spreads[-1])
     if looks is not SETTLED:
-        return Adjusted(fit, observed, appearance, support, shines, None, fitting)
+        return Adjusted(fit, observed, appearance, support, shines)
     is_shaft = _is_shaft(points_mm, before_tip, needle)
     if clipped_share(images, rig, fit.points_mm).max() < WORTH_A_LOOK:
         return Adjusted(fit, observed, appearance, support, shines)

@@ -13,11 +13,11 @@ from needletrack.tracking.needle import EntrySide, Positive
 Observed = tuple[Beside, Beside]
 
 # An edge is blurred over about this much of the curve.
-_EDGE_GAP_MM = 0.5
+EDGE_GAP_MM = 0.5
 _SLEEVE_SHARE = 0.7
 # A sleeve's highlight is a faint line beside the needle's own, which a vessel behind the needle does not end.
 _MAX_LINE_IN_SLEEVE = 0.4
-_CROSSED_MM = 2.0
+CROSSED_MM = 2.0
 # Between two pairs the base moves less than this.
 _BASE_MOTION_MM = 8.0
 # How much of the curve around a rough end tells where the tip is.
@@ -95,7 +95,7 @@ def find_sleeve_edge(
 
 def _is_sleeve(observed: Observed, index: int, outward: int, spacing_mm: float, parameters: EndsParameters) -> bool:
     """Whether both flanks of both views stay changed over the least length of a sleeve, and the needle ends there."""
-    gap, near = round(_EDGE_GAP_MM / spacing_mm), round(parameters.sleeve_step_mm / spacing_mm)
+    gap, near = round(EDGE_GAP_MM / spacing_mm), round(parameters.sleeve_step_mm / spacing_mm)
     far = round(parameters.min_sleeve_mm / spacing_mm)
     at = np.arange(observed[0].flank_gray.shape[1])
     inward = (outward * (index - at) > gap) & (outward * (index - at) <= gap + near)
@@ -118,7 +118,7 @@ def is_crossed(observed: Observed, at_mm: float, arc_mm: Float, parameters: Ends
 
     What lies behind, such as a vessel, begins at another place of the curve in the other view.
     """
-    near = np.abs(arc_mm - at_mm) <= _CROSSED_MM
+    near = np.abs(arc_mm - at_mm) <= CROSSED_MM
     weakest = _common_step(observed, float(arc_mm[1] - arc_mm[0]), parameters)
     return bool(weakest[near].max(initial=0.0) > parameters.sleeve_step_gray)
 
@@ -133,7 +133,7 @@ def _common_step(observed: Observed, spacing_mm: float, parameters: EndsParamete
 def _steps(flanks: Float, spacing_mm: float, parameters: EndsParameters) -> Float:
     """Change (2, N) of each flank's mean grey level from behind a place to ahead of it; zero near the curve's ends."""
     length = max(2, round(parameters.sleeve_step_mm / spacing_mm))
-    gap = max(1, round(_EDGE_GAP_MM / spacing_mm))
+    gap = max(1, round(EDGE_GAP_MM / spacing_mm))
     total = np.cumsum(np.pad(flanks, ((0, 0), (1, 0))), axis=1)
     n = flanks.shape[1]
     at = np.arange(n)

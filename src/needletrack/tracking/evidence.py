@@ -84,7 +84,7 @@ def products(sections: Float) -> Float32:
     """
     contiguous = np.ascontiguousarray(sections, dtype=np.float64)
     shown = np.empty((len(contiguous), len(_PAIRS[0]) + 1), np.float32)
-    call("products", contiguous, len(contiguous), len(OFFSETS), _reference(), shown)
+    call("products", contiguous, len(contiguous), len(OFFSETS), reference(), shown)
     return shown
 
 
@@ -95,8 +95,7 @@ def log_evidence(shown: Float32, appearance: Appearance, grid: Grid) -> Float:
 
 def log_evidence_by_background(shown: Float32, appearance: Appearance, grid: Grid) -> Float32:
     """The same (N, 2 S): before a background that is even, and then before one with clutter."""
-    bank = _bank(float(HALF_WIDTHS[appearance.half_width]), BLURS[appearance.blur], appearance.inside, grid)
-    return shown @ bank
+    return shown @ bank(float(HALF_WIDTHS[appearance.half_width]), BLURS[appearance.blur], appearance.inside, grid)
 
 
 def log_evidence_of_no_needle(shown: Float32, blur: int) -> Float:
@@ -104,7 +103,7 @@ def log_evidence_of_no_needle(shown: Float32, blur: int) -> Float:
 
     The edge is that of something wide: of a sleeve, a rod, a vessel beside the curve. It may be anywhere.
     """
-    each = shown @ _no_needle_bank(BLURS[blur])
+    each = shown @ no_needle_bank(BLURS[blur])
     log = np.empty(len(shown))
     call("no_needle", each, len(shown), each.shape[1] // len(_BACKGROUND_WANDER) - 1, log)
     return log
@@ -133,7 +132,7 @@ _PAIRS = np.triu_indices(len(OFFSETS))
 
 
 @lru_cache(maxsize=1)
-def _reference() -> Float:
+def reference() -> Float:
     """The symmetric matrix that whitens background that wanders least; it treats left and right alike."""
     covariance = _covariances(OFFSETS[None], 0.0, BLURS[0], 0)[0, 0] + np.eye(len(OFFSETS))
     values, vectors = np.linalg.eigh((covariance + covariance[::-1, ::-1]) / 2)
@@ -141,7 +140,7 @@ def _reference() -> Float:
 
 
 @lru_cache(maxsize=1024)
-def _bank(half_width: float, blur: float, inside: int, grid: Grid) -> Float32:
+def bank(half_width: float, blur: float, inside: int, grid: Grid) -> Float32:
     """The hypotheses of one half width at every shift of the grid; of 0: of background alone, without shifts.
 
     They are the weights (F, kinds * shifts) of `products` in their log evidence.
@@ -164,10 +163,10 @@ def _bank(half_width: float, blur: float, inside: int, grid: Grid) -> Float32:
 
 
 @lru_cache(maxsize=64)
-def _no_needle_bank(blur: float) -> Float32:
+def no_needle_bank(blur: float) -> Float32:
     """Background alone, then a single edge at every sample but the outermost ones."""
     edge = _as_bank(*_forms(_covariances(OFFSETS - OFFSETS[2:-2, None], _EDGE_HALF_WIDTH, blur, 0)))
-    return np.hstack([_bank(0.0, blur, 0, _HERE), edge])
+    return np.hstack([bank(0.0, blur, 0, _HERE), edge])
 
 
 def _as_bank(forms: Float, log_determinants: Float) -> Float32:
@@ -178,11 +177,11 @@ def _as_bank(forms: Float, log_determinants: Float) -> Float32:
 
 
 def _forms(covariances: Float) -> tuple[Float, Float]:
-    """Quadratic forms (shifts, kinds, n, n) of misfits in sections whitened by `_reference`; log determinants.
+    """Quadratic forms (shifts, kinds, n, n) of misfits in sections whitened by `reference`; log determinants.
 
     covariances (shifts, kinds, n, n): of what is seen but for the noise.
     """
-    whitener = _reference()
+    whitener = reference()
     white = whitener @ (covariances + np.eye(covariances.shape[-1])) @ whitener
     log_determinants = np.log(np.diagonal(np.linalg.cholesky(white), axis1=2, axis2=3)).sum(axis=2)
     log_determinants -= np.linalg.slogdet(whitener)[1]

@@ -25,11 +25,11 @@ from needletrack.tracking.needle import Positive
 # Points triangulated from two skeletons scatter by about this much.
 _SKELETON_SIGMA_MM = 0.3
 # Sigmas by which a streak's places may be off its line before they count for less.
-_ROBUST_SIGMAS = 2.0
+ROBUST_SIGMAS = 2.0
 # Points of the curve may slide along it by so much.
 _ALONG_SIGMA_MM = 0.3
 # Robust weights settle in so many rounds.
-_ROUNDS = 2
+ROUNDS = 2
 
 
 class FitParameters(BaseModel):
@@ -283,7 +283,7 @@ class CurveFitting:
             self._smooth,
             self._share,
             self._parameters.robust_px,
-            _ROUNDS,
+            ROUNDS,
             self._normal,
             np.empty(3 * n + 3 * m * (6 * m + 4)),
         )
@@ -363,7 +363,7 @@ class CurveFitting:
             streak.radius_px,
             np.array([parameters.streak_share, parameters.streak_change_share, parameters.streak_bend_share]),
             parameters.streak_mm,
-            _ROBUST_SIGMAS,
+            ROBUST_SIGMAS,
             expected,
             np.empty((len(index) + 3 * m + 16) * len(index)),
         )

@@ -15,7 +15,7 @@ from needletrack.geometry.spline import arc_length, resample, unit
 from needletrack.geometry.stereo import StereoRig
 from needletrack.geometry.transform import RigidTransform
 from needletrack.records import Appearance, Float, NeedleTrack, Reason
-from needletrack.tracking.adjust import GROWING, MOVED, ROUGH, SETTLED, Adjusted, Images, adjust, brought_to_end
+from needletrack.tracking.adjust import GROWING, MOVED, ROUGH, SETTLED, Adjusted, Images, adjust
 from needletrack.tracking.beside import Beside, BesideParameters, look_beside
 from needletrack.tracking.clipped import WORTH_A_LOOK, clipped_share
 from needletrack.tracking.ends import (
@@ -30,6 +30,17 @@ from needletrack.tracking.ends import (
 )
 from needletrack.tracking.evidence import WIDE
 from needletrack.tracking.fit import CurveFit, EndObservation, Ends, FitParameters
+from needletrack.tracking.glance import (
+    ADVANCE_SIGMA_MM_S,
+    MIN_DEPTH_MM,
+    MOST_ADVANCE_MM,
+    PARABOLA_MM,
+    TIP_REACH_MM,
+    TIP_ROUNDS,
+    GlanceParameters,
+    Steady,
+    glance,
+)
 from needletrack.tracking.needle import Needle, Positive, Workspace
 from needletrack.tracking.profile import Mask
 from needletrack.tracking.silhouette import AxisOffsets, axis_evidence, cut_sections, diameter_mm
@@ -44,25 +55,18 @@ from needletrack.tracking.tip import (
     find_tip,
 )
 
-MIN_DEPTH_MM = 20.0
 # How far behind a sleeve's edge the needle is looked for once more, for how long a stretch and how strong a line.
 GOES_ON_FROM_MM, GOES_ON_TO_MM, GOES_ON_MM, GOES_ON_SHARE = 3.0, 16.0, 4.0, 0.6
 # Lens blur and saturation show a needle wider than it is.
 WIDTH_ALLOWANCE = 1.4
 # No single section has more of a say than these log odds.
 _MOST_ODDS = 30.0
-# The tip is looked for this far beyond where the needle was followed to, in so many rounds.
-_TIP_REACH_MM, _TIP_ROUNDS = 12.0, 4
 # And once more where it was not within this of the end of the curve.
 _TIP_MOVED_MM = 0.3
 # What a needle that is followed looks like is found anew once in so many pairs.
 _PAIRS_PER_APPEARANCE = 8
 # Less than so much that looks like more of a needle beyond an end is none.
 _GOES_ON_MM = 1.5
-# Between two pairs the tip is not expected to come further than this; the curve is kept so far beyond, mm.
-_MOST_ADVANCE_MM, _STEADY_BEYOND_MM = 3.0, 3.0
-# Nor is it off from where its motion would take it by more than a few of these, a second.
-_ADVANCE_SIGMA_MM_S = 18.0
 # Images without stamps are of a sequence as fast as cameras are.
 _USUAL_S = 1 / 30
 # Weaknesses of a track that is followed nevertheless: its shape is that of the needle, to its end.
@@ -107,7 +111,7 @@ class RefineModels:
 class Refined:
     """The needle's curve, base -> tip where base_is_known, and what it rests on.
 
-    The points of `fit` and of `observed` correspond. tip_px holds the tip as the left and the right view alone place
+    tip_px holds the tip as the left and the right view alone place
     it, raw px (2, 2); tip_is_free is false where something crosses there, behind which the needle may go on. log_odds:
     of such a needle over none, both views together; no single section has more than its say. shown (2, N): where each
     view shows the needle, by its silhouette or by the streak of light on it. calibration_mm2 (N, 3, 3): what the
@@ -115,7 +119,6 @@ class Refined:
     """
 
     fit: CurveFit
-    observed: tuple[AxisOffsets, AxisOffsets]
     shown: Mask
     appearance: Appearance
     diameter_mm: float
@@ -154,7 +157,7 @@ def refine(
     """
     steady = _steady(previous, since_s, models.needle)
     if steady is not None and not steady.is_due and clipped_share(images, rig, steady.points_mm).max() < WORTH_A_LOOK:
-        refined = _refined_steady(images, rig, steady, models)
+        refined = _glanced(images, rig, steady, models)
         if refined is not None:
             return refined
     if steady is None:
@@ -201,22 +204,6 @@ def refine(
 
 
 @dataclass(frozen=True, slots=True)
-class _Steady:
-    """A needle that was seen whole in the pair before: its curve (N, 3), what it looked like, how its tip is shaped.
-
-    since_s: how long ago that was; advance_mm: how far its tip comes in that time. is_due: what it looks like is found
-    anew.
-    """
-
-    points_mm: Float
-    appearance: Appearance
-    taper_mm: float
-    since_s: float
-    advance_mm: float
-    is_due: bool
-
-
-@dataclass(frozen=True, slots=True)
 class _Ended:
     """A tip, the curve (N, 3) on which it was looked for, and the curve that ends there, as both views show it."""
 
@@ -226,42 +213,30 @@ class _Ended:
     ends: Ends
 
 
-def _refined_steady(images: Images, rig: StereoRig, steady: _Steady, models: RefineModels) -> Refined | None:
+def _glanced(images: Images, rig: StereoRig, steady: Steady, models: RefineModels) -> Refined | None:
     """The needle where it was moved to since, looked at once: what it looks like and where its base is are known.
 
     None where its tip lies beyond what was looked at.
     """
-    spacing = models.refine.spacing_mm
-    foreseen_mm = float(arc_length(steady.points_mm)[-1])
-    foreseen_mm += float(np.clip(steady.advance_mm, -_MOST_ADVANCE_MM, _MOST_ADVANCE_MM))
-    beyond_mm = _beyond(steady.points_mm, round((_MOST_ADVANCE_MM + _STEADY_BEYOND_MM) / spacing), spacing)
-    points = _cut(np.concatenate([steady.points_mm, beyond_mm]), 0.0, foreseen_mm + _STEADY_BEYOND_MM, spacing)
-    before_tip_mm = foreseen_mm - arc_length(points)
-    moved = adjust(
+    seen = glance(
         images,
         rig,
-        points,
-        models.needle,
-        models.fit,
-        steady.appearance,
-        looks=MOVED,
-        looks_the_same=True,
-        before_tip=(np.maximum(before_tip_mm, 0.0), steady.taper_mm),
-        bent_for_s=steady.since_s,
+        steady,
+        GlanceParameters(models.needle, models.fit, models.ends, models.tip, models.beside, models.refine.spacing_mm),
     )
-    tip, along_mm = _tip(images, rig, moved.fit.points_mm[before_tip_mm >= 0], moved, models, steady)
-    if tip.at_mm < models.needle.min_length_mm / 2:
-        raise NeedleNotFound("refine", Reason.TOO_SHORT)
-    arc = arc_length(moved.fit.points_mm)
-    if tip.at_mm > arc[-1]:
+    if seen is None:
         return None
-    index = int(np.abs(arc - tip.at_mm).argmin())
-    left, right = (
-        (_end_observation(moved.fit.points_mm, index, camera, pose, each - arc[index], sigma),)
-        for camera, pose, each, sigma in zip(*_views(rig), tip.each_mm, tip.sigma_mm, strict=True)
+    return Refined(
+        seen.fit,
+        seen.shown,
+        steady.appearance,
+        diameter_mm(steady.appearance, models.needle),
+        True,
+        seen.tip,
+        seen.tip_is_free,
+        seen.tip_px,
+        float(np.clip(seen.support, -_MOST_ODDS, _MOST_ODDS).sum()),
     )
-    final = brought_to_end(moved, tip.at_mm, (left, right), spacing, models.fit)
-    return _with_tip(images, rig, _Ended(tip, along_mm, final, (left, right)), models, base_is_known=True)
 
 
 def _with_tip(images: Images, rig: StereoRig, ended: _Ended, models: RefineModels, *, base_is_known: bool) -> Refined:
@@ -274,7 +249,6 @@ def _with_tip(images: Images, rig: StereoRig, ended: _Ended, models: RefineModel
     is_free = not is_crossed(beside, min(tip.at_mm, TIP_BEFORE_MM), arc_length(beyond), models.ends)
     return Refined(
         final.fit,
-        final.observed,
         np.stack([view.seen for view in final.observed]) | final.shines,
         replace(final.appearance, taper_mm=tip.taper_mm),
         seen_diameter_mm if final.flanks is None else final.flanks.diameter_mm,
@@ -292,7 +266,7 @@ def _ended(
     curve_mm: Float,
     adjusted: Adjusted,
     models: RefineModels,
-    steady: _Steady | None = None,
+    steady: Steady | None = None,
 ) -> _Ended:
     """The curve brought to an end at the tip itself; raises NeedleNotFound where hardly anything is left of it."""
     tip, along_mm = _tip(images, rig, curve_mm, adjusted, models, steady)
@@ -321,17 +295,17 @@ def _ended(
 
 
 def _tip(
-    images: Images, rig: StereoRig, curve: Float, adjusted: Adjusted, models: RefineModels, steady: _Steady | None
+    images: Images, rig: StereoRig, curve: Float, adjusted: Adjusted, models: RefineModels, steady: Steady | None
 ) -> tuple[TipFit, Float]:
     """The tip, and the curve (N, 3) on which it lies, from the base to well beyond it."""
     needle, tried_mm = models.needle, TRIED_MM
     if steady is not None and not steady.is_due:
         needle, tried_mm = needle.model_copy(update={"tip_tapers_mm": (steady.taper_mm,)}), TRIED_AGAIN_MM
     spacing = models.refine.spacing_mm
-    along = np.concatenate([curve, _beyond(curve, round(_TIP_REACH_MM / spacing), spacing)])
+    along = np.concatenate([curve, _beyond(curve, round(TIP_REACH_MM / spacing), spacing)])
     arc = arc_length(along)
-    end_mm, remaining = float(arc[len(curve) - 1]), _TIP_ROUNDS
-    foreseen_mm = (end_mm, np.inf if steady is None else _ADVANCE_SIGMA_MM_S * steady.since_s)
+    end_mm, remaining = float(arc[len(curve) - 1]), TIP_ROUNDS
+    foreseen_mm = (end_mm, np.inf if steady is None else ADVANCE_SIGMA_MM_S * steady.since_s)
     while True:
         rows_mm = np.arange(max(0.0, end_mm - BEFORE_MM), min(end_mm + BEYOND_MM, arc[-1]), ROW_MM)
         rows = np.column_stack([np.interp(rows_mm, arc, column) for column in along.T])
@@ -401,7 +375,7 @@ def _tip_px(view: AxisOffsets, end: EndObservation) -> Float:
     return np.asarray(view.center_px[-1] + view.offset_px[-1] * normal + end.shift_px * along)
 
 
-def _steady(previous: NeedleTrack | None, since_s: float, needle: Needle) -> _Steady | None:
+def _steady(previous: NeedleTrack | None, since_s: float, needle: Needle) -> Steady | None:
     """What the track before tells, where it can be relied on."""
     if previous is None or previous.curve is None or previous.appearance is None:
         return None
@@ -410,7 +384,7 @@ def _steady(previous: NeedleTrack | None, since_s: float, needle: Needle) -> _St
     taper_mm, tip = previous.appearance.taper_mm, previous.tip
     if taper_mm is None or taper_mm not in needle.tip_tapers_mm:
         return None
-    return _Steady(
+    return Steady(
         previous.curve.points_mm,
         previous.appearance,
         taper_mm,
@@ -420,13 +394,13 @@ def _steady(previous: NeedleTrack | None, since_s: float, needle: Needle) -> _St
     )
 
 
-def _moved(images: Images, rig: StereoRig, steady: _Steady, models: RefineModels) -> Adjusted:
+def _moved(images: Images, rig: StereoRig, steady: Steady, models: RefineModels) -> Adjusted:
     """The curve of a needle that was seen whole in the pair before, where it is now."""
     spacing = models.refine.spacing_mm
-    points = np.concatenate([steady.points_mm, _beyond(steady.points_mm, round(_MOST_ADVANCE_MM / spacing), spacing)])
+    points = np.concatenate([steady.points_mm, _beyond(steady.points_mm, round(MOST_ADVANCE_MM / spacing), spacing)])
     length_mm = float(arc_length(steady.points_mm)[-1])
     points = _cut(
-        points, 0.0, length_mm + float(np.clip(steady.advance_mm, -_MOST_ADVANCE_MM, _MOST_ADVANCE_MM)), spacing
+        points, 0.0, length_mm + float(np.clip(steady.advance_mm, -MOST_ADVANCE_MM, MOST_ADVANCE_MM)), spacing
     )
     return adjust(
         images,
@@ -532,7 +506,7 @@ def _extended(points_mm: Float, reach_mm: float, spacing_mm: float) -> Float:
 
 
 def _beyond(points_mm: Float, count: int, spacing_mm: float) -> Float:
-    stretch = points_mm[-min(len(points_mm), round(12.0 / spacing_mm)) :]
+    stretch = points_mm[-min(len(points_mm), round(PARABOLA_MM / spacing_mm)) :]
     s = arc_length(stretch) - arc_length(stretch)[-1]
     design = np.column_stack([s, s**2])
     slope, bend = np.linalg.lstsq(design, stretch - stretch[-1], rcond=None)[0]

@@ -32,27 +32,27 @@ from needletrack.tracking.needle import Needle
 from needletrack.tracking.profile import Mask
 
 # A section is the mean of so many rows across the needle, about a pixel apart.
-_ROWS_PER_SECTION = 5
+ROWS_PER_SECTION = 5
 # The unit in which a section is measured: its noise, and what the model leaves out, which is at least so many greys.
-_LEAST_UNIT_GRAY = 1.0
-_UNIT_PER_NOISE = 0.7
+LEAST_UNIT_GRAY = 1.0
+UNIT_PER_NOISE = 0.7
 # Log Bayes factor of a needle over none from which on a section has a say.
-_USED = 2.0
+USED = 2.0
 # A section may be of something else altogether, at this log density.
-_LOG_OUTLIER = -12.0
-_OUTLIER = float(np.exp(_LOG_OUTLIER))
-_LOG_NEVER = -1e4
+LOG_OUTLIER = -12.0
+OUTLIER = float(np.exp(LOG_OUTLIER))
+LOG_NEVER = -1e4
 # Log odds against the axis turning aside from a nearly right curve, per unit.
 _TURN_PRICE = 6.0
 # Differences between the motions of the two ends that are tried, units; log odds against a motion, per unit squared.
-_DRIFTS = np.linspace(-4.0, 4.0, 17)
-_MOTION_PRICE = 1.0
+DRIFTS = np.linspace(-4.0, 4.0, 17)
+MOTION_PRICE = 1.0
 # What is not noise, such as the interpolation between pixels: an axis point is no better than this, units.
-_LEAST_SIGMA = 0.03
+LEAST_SIGMA = 0.03
 # What lies about the needle before clutter misleads neighbouring sections alike: together they are worth fewer of them.
-_CLUTTERED = 2.0
+CLUTTERED = 2.0
 # A section that narrows the expectation by less than this share tells nothing.
-_LEAST_GAIN = 0.3
+LEAST_GAIN = 0.3
 # So many sections of each view decide on the appearance; a section has at most so much of a say.
 _DECIDING = 16
 # An inside is lively where this share of sections says so, by this much each, and the others do not deny it: where
@@ -124,13 +124,13 @@ def cut_sections(image: Image, camera: Camera, local_mm: Float, needle: Needle) 
         camera.lens,
         local,
         count,
-        _ROWS_PER_SECTION,
+        ROWS_PER_SECTION,
         OFFSETS,
         columns,
         unit_mm(needle),
-        _LEAST_UNIT_GRAY,
-        _UNIT_PER_NOISE,
-        np.empty(_ROWS_PER_SECTION * count * (7 + columns)),
+        LEAST_UNIT_GRAY,
+        UNIT_PER_NOISE,
+        np.empty(ROWS_PER_SECTION * count * (7 + columns)),
         center,
         normal,
         values,
@@ -262,10 +262,10 @@ class AxisEvidence:
             sections.px_per_unit,
             sections.inside,
             self.cluttered & self.shines,
-            _LEAST_GAIN,
-            _LEAST_SIGMA,
-            _USED,
-            _CLUTTERED,
+            LEAST_GAIN,
+            LEAST_SIGMA,
+            USED,
+            CLUTTERED,
             offset,
             sigma,
             support,
@@ -288,11 +288,11 @@ class AxisEvidence:
             log,
             len(log),
             len(shifts),
-            _DRIFTS,
-            len(_DRIFTS),
+            DRIFTS,
+            len(DRIFTS),
             step,
-            _MOTION_PRICE,
-            _LOG_OUTLIER,
+            MOTION_PRICE,
+            LOG_OUTLIER,
             moved,
         )
         return np.asarray(moved * self.sections.px_per_unit)
@@ -301,7 +301,7 @@ class AxisEvidence:
     def _floored(self) -> Float:
         """The log evidence (N, S) over its most; a section may be of something else altogether."""
         most, _, _ = self._prepared
-        return np.maximum(self.log_evidence - most[:, None], _LOG_OUTLIER)
+        return np.maximum(self.log_evidence - most[:, None], LOG_OUTLIER)
 
     @cached_property
     def _prepared(self) -> tuple[Float, Float32, Float32]:
@@ -317,8 +317,8 @@ class AxisEvidence:
             places,
             grid.refine,
             len(grid.fine_shifts),
-            _LOG_NEVER,
-            _OUTLIER,
+            LOG_NEVER,
+            OUTLIER,
             most,
             relative,
             likelihood,

@@ -17,11 +17,12 @@ from scipy.special import ndtr
 
 from needletrack.errors import NeedleNotFound
 from needletrack.geometry.camera import Camera
-from needletrack.kernels import TipView, address, call, two_tip_views
+from needletrack.kernels import Array, TipView, address, call, two_tip_views
 from needletrack.records import Appearance, Float, Image, Reason
 from needletrack.tracking.clipped import Flanks, outline
 from needletrack.tracking.evidence import BLURS, HALF_WIDTHS
 from needletrack.tracking.needle import Needle, Positive
+from needletrack.tracking.profile import Mask
 from needletrack.tracking.silhouette import rows_of, unit_mm
 
 # What is looked at, mm before and beyond a rough end, and the spacing of its rows.
@@ -151,18 +152,18 @@ def find_tip(
         end_mm,
         rules(tried_mm, foreseen_mm, end_mm, parameters),
         found,
-        np.empty((len(arc_mm) + 1) * 19 * 16 + 2 * 23 * 23),
+        np.empty((len(arc_mm) + 1) * 19 * 16 + len(arc_mm) + 2 * 23 * 23),
     )
     del kept
     if failed:
         raise NeedleNotFound("tip", Reason.TIP_NOT_SEEN)
-    return tip_fit(found, needle)
+    return tip_fit(found, needle.tip_tapers_mm)
 
 
-def tip_fit(found: Float, needle: Needle) -> TipFit:
-    """What the kernel found (8,)."""
+def tip_fit(found: Float, tapers_mm: tuple[float, ...]) -> TipFit:
+    """What the kernel found (8,) among ends of these shapes."""
     at_mm, *rest, shape = found.tolist()
-    return TipFit(at_mm, (rest[0], rest[1]), (rest[2], rest[3]), (rest[4], rest[5]), needle.tip_tapers_mm[int(shape)])
+    return TipFit(at_mm, (rest[0], rest[1]), (rest[2], rest[3]), (rest[4], rest[5]), tapers_mm[int(shape)])
 
 
 def rules(
@@ -203,7 +204,7 @@ def _look(
     appearance: Appearance,
     needle: Needle,
     edge: _Edge | None,
-) -> list[Float]:
+) -> list[Array]:
     """Lays out one view of an end, straightened, for the kernel; returns the arrays that it points to.
 
     What does not depend on where the apex is, is prepared: the background's seven parts, the last of them what lies
@@ -233,13 +234,12 @@ def _look(
         np.empty(4 * count * columns + 16 * count),
     )
     view.weight, view.weighted, view.fixed = address(weight), address(weighted), address(fixed)
-    view.noise_gray, view.parts = float(noise[0]), 2 * _PARTS
-    kept = [weight, weighted, fixed]
+    view.noise_gray = float(noise[0])
+    kept: list[Array] = [weight, weighted, fixed]
     for shape, taper_mm in enumerate(needle.tip_tapers_mm):
-        before_mm, pictures = inside_pictures(taper_mm, appearance, unit_mm(needle), stepped(sine), edge)
-        view.pictures[shape], view.distances[shape] = address(pictures), len(before_mm)
-        view.before_mm[shape] = before_mm[0]
-        kept.append(pictures)
+        pictures = inside_pictures(taper_mm, appearance, unit_mm(needle), stepped(sine), edge)
+        pictures.lay_out(view, shape)
+        kept += [pictures.parts, pictures.own, pictures.there]
     return kept
 
 
@@ -253,14 +253,31 @@ def stepped(sine: float) -> float:
     return max(round(sine / _SINE_STEP) * _SINE_STEP, 0.2)
 
 
-@lru_cache(maxsize=256)
+@dataclass(frozen=True, eq=False)
+class EndPictures:
+    """Pictures (S, parts, columns) of each part of the inside of an end, from before_mm before its apex on.
+
+    own (S, parts, parts): their products; there (S, parts): whether a part shows there at all. Before and beyond them
+    all is as in the outermost.
+    """
+
+    before_mm: float
+    parts: Float
+    own: Float
+    there: Mask
+
+    def lay_out(self, view: TipView, shape: int) -> None:
+        """Hands them to the kernel as those of a shape; the view points to their arrays."""
+        view.parts, view.distances[shape], view.before_mm[shape] = self.parts.shape[1], len(self.parts), self.before_mm
+        view.pictures[shape], view.own[shape] = address(self.parts), address(self.own)
+        view.there[shape] = address(self.there)
+
+
+@lru_cache(maxsize=64)
 def inside_pictures(
     taper_mm: float, appearance: Appearance, unit_length_mm: float, sine: float, edge: _Edge | None
-) -> tuple[Float, Float]:
-    """Distances before the apex (S,), mm, and the pictures (parts, S, columns) of each part of the inside there.
-
-    Before and beyond them all is as in the outermost. edge: of a clipped needle, which looks wider than it is.
-    """
+) -> EndPictures:
+    """The pictures of an end; edge: of a clipped needle, which looks wider than it is."""
     half_width, blur = float(HALF_WIDTHS[appearance.half_width]), BLURS[appearance.blur]
     true = half_width if edge is None else min(edge.half_width, half_width)
     radius_mm = true * unit_length_mm
@@ -284,7 +301,12 @@ def inside_pictures(
     parts = passed[:-1] - passed[1:]
     on_end = (before < (taper_mm or radius_mm))[:, None]
     parts = np.concatenate([np.where(on_end, 0.0, parts), np.where(on_end, parts, 0.0)])
-    return before, np.ascontiguousarray(gaussian_filter1d(parts, along_mm / PICTURE_MM, axis=1, mode="nearest"))
+    smooth = gaussian_filter1d(parts, along_mm / PICTURE_MM, axis=1, mode="nearest")
+    pictures = np.ascontiguousarray(smooth.swapaxes(0, 1))
+    distances, count, columns = pictures.shape
+    own, there = np.empty((distances, count, count)), np.empty((distances, count), np.bool_)
+    call("pictures_of", pictures, distances, count, columns, own, there)
+    return EndPictures(float(before[0]), pictures, own, there)
 
 
 @lru_cache(maxsize=1)

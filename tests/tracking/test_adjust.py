@@ -110,7 +110,7 @@ def repeated(name: str, parameters: FitParameters) -> Repeats:
         rng = np.random.default_rng(seed)
         images = exposed(left, Noise(), rng), exposed(right, Noise(), rng)
         fit = adjust(images, RIG, true_mm, NEEDLE, parameters).fit
-        covariance = fit.point_covariance_mm2()
+        covariance = fit.point_covariance_mm2
         along = spline.unit(fit.derivative(1))
         here = []
         for i in range(5, len(true_mm) - 5, 7):

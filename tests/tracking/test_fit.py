@@ -96,7 +96,7 @@ def sigma_mm(fit: CurveFit) -> Float:
     """Square root (N,) of the largest variance across the curve."""
     along = spline.unit(fit.derivative(1))
     flat = np.eye(3) - along[:, :, None] * along[:, None, :]
-    return np.asarray(np.sqrt(np.linalg.eigvalsh(flat @ fit.point_covariance_mm2() @ flat)[:, -1]))
+    return np.asarray(np.sqrt(np.linalg.eigvalsh(flat @ fit.point_covariance_mm2 @ flat)[:, -1]))
 
 
 @pytest.mark.parametrize(("radius_mm", "within_mm"), [(STRAIGHT, 1e-7), (BENT, 1e-4)])
@@ -150,7 +150,7 @@ def normalized_squares(
     for seed in range(seeds):
         views = observed(points_mm, true_mm, (noise_px(rng), noise_px(rng)), seen)
         fit = fit_curve(points_mm, views, RIG, parameters)
-        covariance = fit.point_covariance_mm2()
+        covariance = fit.point_covariance_mm2
         along = spline.unit(fit.derivative(1))
         for k, i in enumerate(places):
             flat = np.eye(3) - np.outer(along[i], along[i])
@@ -200,7 +200,7 @@ def test_what_one_camera_sees_is_uncertain_along_its_ray(hidden_view: int) -> No
     np.testing.assert_allclose(sigma_mm(by_one)[:30], sigma_mm(by_two)[:30], rtol=0.05)
     along = spline.unit(by_one.derivative(1))[at]
     flat = np.eye(3) - np.outer(along, along)
-    values, axes = np.linalg.eigh(flat @ by_one.point_covariance_mm2()[at] @ flat)
+    values, axes = np.linalg.eigh(flat @ by_one.point_covariance_mm2[at] @ flat)
     camera_mm = (
         -RIG.right_from_left.rotation.T @ RIG.right_from_left.translation_mm if hidden_view == 0 else np.zeros(3)
     )
@@ -213,7 +213,7 @@ def test_what_one_camera_sees_is_uncertain_along_its_ray(hidden_view: int) -> No
 def sigma_across_ray(fit: CurveFit, at: int) -> float:
     along = spline.unit(fit.derivative(1))[at]
     flat = np.eye(3) - np.outer(along, along)
-    return float(np.sqrt(np.linalg.eigvalsh(flat @ fit.point_covariance_mm2()[at] @ flat)[1]))
+    return float(np.sqrt(np.linalg.eigvalsh(flat @ fit.point_covariance_mm2[at] @ flat)[1]))
 
 
 def test_a_gap_in_one_view_is_stated_honestly() -> None:
@@ -303,7 +303,7 @@ def test_little_to_go_by_gives_large_sigmas_and_no_nan(
     points_mm, true_mm = arc(STRAIGHT, direction), arc(STRAIGHT, direction, 8.0)
     seen = np.stack([only(left), only(right)])
     fit = fit_curve(points_mm, observed(points_mm, true_mm, seen=seen), RIG, PARAMETERS)
-    for values in (fit.points_mm, fit.control_mm, fit.covariance_mm2, fit.point_covariance_mm2(), fit.derivative(2)):
+    for values in (fit.points_mm, fit.control_mm, fit.covariance_mm2, fit.point_covariance_mm2, fit.derivative(2)):
         assert np.isfinite(values).all()
     assert sigma_mm(fit).max() > 1.0
     assert np.linalg.eigvalsh(fit.covariance_mm2).min() > 0

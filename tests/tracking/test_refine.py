@@ -181,7 +181,7 @@ def test_something_without_end_is_too_long() -> None:
 
 def test_each_stretch_knows_its_own_uncertainty() -> None:
     found = refined(scene("dark"), scene("dark").truth.centerline_mm)
-    sigma_mm = np.sqrt(np.linalg.eigvalsh(found.fit.point_covariance_mm2())[:, -1])
+    sigma_mm = np.sqrt(np.linalg.eigvalsh(found.fit.point_covariance_mm2)[:, -1])
     off_mm = distance_from_curve(found.fit.points_mm[3:], scene("dark").truth.centerline_mm)
     assert (off_mm < 3 * sigma_mm[3:]).all()
     assert spline.arc_length(found.fit.points_mm)[-1] == pytest.approx(68.0, abs=BASE_MM + TIP_MM)

@@ -6,7 +6,7 @@
 
 #include "kernels.h"
 
-enum { FOUND, BEYOND, NOT_SEEN, NOT_HELD, TOO_SHORT, NO_TIP, TOO_NEAR, NO_MEMORY };
+enum { FOUND, BEYOND, NOT_SEEN, NOT_HELD, TOO_SHORT, NO_TIP, TOO_NEAR, CLIPPED, NO_MEMORY };
 
 /* One view; as `glance._Eye` lays it out. */
 typedef struct {
@@ -22,6 +22,8 @@ typedef struct {
   int64_t before;
   double advance_mm, taper_mm, since_s;
   /* How the curve is sampled. */
+  /* A needle that is white along more than this share of it is another matter. */
+  double white_gray, white_share;
   double spacing_mm, most_advance_mm, beyond_mm, parabola_mm, least_depth_mm, least_length_mm;
   /* Sections and their evidence. */
   int64_t rows_per_section;
@@ -248,6 +250,13 @@ static int tell(const Glance *g, const Eye *eye, const double *local, int64_t n,
   cut_sections(eye->image, eye->rows, eye->columns, eye->stride, eye->own, local, n, g->rows_per_section, g->offsets,
                places, g->unit_mm, g->least_gray, g->per_noise, work, t->center, t->normal, t->values, t->scale,
                t->inside);
+  double white = 0, all = 0;
+  for (int64_t i = 0; i < n; i++) {
+    if (width[i] < 0 || !t->inside[i]) continue;
+    const uint8_t *row = eye->image + (int64_t)rint(t->center[2 * i + 1]) * eye->stride;
+    white += row[(int64_t)rint(t->center[2 * i])] >= g->white_gray, all++;
+  }
+  if (white >= g->white_share * all && white > 0) return CLIPPED;
   products(t->values, n, places, g->whitener, shown);
   multiply(shown, n, f, g->none_bank, 2 + 2 * g->edges, nothing);
   no_needle(nothing, n, g->edges, none);

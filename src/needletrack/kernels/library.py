@@ -3,7 +3,7 @@
 import ctypes
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import numpy.typing as npt
@@ -27,6 +27,7 @@ def load(path: Path) -> ctypes.CDLL:
         ) from error
     # An item of a library is a new function each time; an attribute is kept.
     library.streak_misfit.restype = ctypes.c_double
+    library.told_of_curve.restype = ctypes.c_double
     library.tip_picture.restype = ctypes.c_double
     library.find_streak.restype = ctypes.c_int64
     return library
@@ -40,10 +41,8 @@ def best_library() -> Path:
 _library = load(best_library())
 
 
-def address(array: Array | None) -> int | None:
+def address(array: Array) -> int:
     """Where the values of a C-contiguous array lie; the caller keeps it alive. Raises ValueError for any other."""
-    if array is None:
-        return None
     if not array.flags.c_contiguous:
         raise ValueError("a kernel reads arrays that are contiguous")
     return int(array.__array_interface__["data"][0])
@@ -86,7 +85,7 @@ def packed_lens(
 class Sight(ctypes.Structure):
     """What one view measures of a curve, as `fit.c` lays it out. `keep` holds the arrays it points to."""
 
-    _fields_: Sequence[tuple[str, Any]] = [
+    _fields_: ClassVar[Sequence[tuple[str, Any]]] = [
         ("camera", ctypes.c_void_p),
         ("here_px", ctypes.c_void_p),
         ("ahead", ctypes.c_void_p),
@@ -122,7 +121,7 @@ MOST_SHAPES = 8
 class TipView(ctypes.Structure):
     """One view of an end, and pictures of the shapes of end that are tried, as `kernels.h` lays it out."""
 
-    _fields_: Sequence[tuple[str, Any]] = [
+    _fields_: ClassVar[Sequence[tuple[str, Any]]] = [
         ("weight", ctypes.c_void_p),
         ("weighted", ctypes.c_void_p),
         ("fixed", ctypes.c_void_p),

@@ -1,24 +1,17 @@
 /* The image straightened along a projected curve, and its cross sections. */
 #include "kernels.h"
 
-/* Cubic convolution (Keys 1981) with a = -0.75, as OpenCV's. */
-static inline void cubic(float t, float *w) {
-  const float a = -0.75f;
-  w[0] = ((a * (t + 1) - 5 * a) * (t + 1) + 8 * a) * (t + 1) - 4 * a;
-  w[1] = ((a + 2) * t - (a + 3)) * t * t + 1;
-  w[2] = ((a + 2) * (1 - t) - (a + 3)) * (1 - t) * (1 - t) + 1;
-  w[3] = 1 - w[0] - w[1] - w[2];
-}
-
 static inline int64_t within(int64_t i, int64_t n) { return i < 0 ? 0 : i >= n ? n - 1 : i; }
 
 typedef float Four __attribute__((vector_size(16)));
 typedef uint8_t FourBytes __attribute__((vector_size(4)));
 
+/* Cubic convolution (Keys 1981) with a = -0.75, as OpenCV's: weights of the four pixels about a place. */
 static inline Four weights(float t) {
-  float w[4];
-  cubic(t, w);
-  return (Four){w[0], w[1], w[2], w[3]};
+  const float a = -0.75f;
+  const Four cubed = {a, a + 2, -(a + 2), -a}, squared = {-2 * a, -(a + 3), 2 * a + 3, a}, once = {a, 0, -a, 0},
+             constant = {0, 1, 0, 0};
+  return ((cubed * t + squared) * t + once) * t + constant;
 }
 
 static inline float sampled(const uint8_t *image, int64_t rows, int64_t columns, int64_t stride, float x, float y) {

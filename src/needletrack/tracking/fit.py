@@ -7,7 +7,7 @@ the stated covariance says so.
 """
 
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from typing import Protocol
 
 import numpy as np
@@ -66,7 +66,7 @@ class FitParameters(BaseModel):
     streak_mm: Positive = Field(30.0, description="Length of needle over which that distance changes, mm.")
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, eq=False)
 class CurveFit:
     """A fitted curve: parameters (N,) in [0, 1], control_mm (M, 3) with covariance_mm2 (3M, 3M), points_mm (N, 3).
 
@@ -87,6 +87,7 @@ class CurveFit:
         """Derivative (N, 3) of the curve by its parameter."""
         return spline_basis(self.parameters, len(self.control_mm), derivative=order).curve(self.control_mm)
 
+    @cached_property
     def point_covariance_mm2(self) -> Float:
         """Covariance (N, 3, 3) of every point."""
         b = spline_basis(self.parameters, len(self.control_mm))
@@ -415,7 +416,7 @@ class _View:
         sight.line_weighted = self._kept("line_weighted", np.empty((len(index), self._size)))
         sight.line_normal = self._kept("line_normal", np.empty((self._size, self._size)))
 
-    def _kept(self, name: str, array: Float | Int) -> int | None:
+    def _kept(self, name: str, array: Float | Int) -> int:
         # The kernels see addresses; the arrays must live as long.
         self._arrays[name] = array
         return address(array)

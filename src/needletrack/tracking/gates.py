@@ -7,9 +7,6 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
 from needletrack.errors import NeedleNotFound
-from needletrack.geometry.epipolar import epipolar_lines
-from needletrack.geometry.spline import tangents
-from needletrack.geometry.stereo import StereoRig
 from needletrack.records import Float, NeedleCurve, NeedleTrack, Quality, Reason, Status
 from needletrack.tracking.match import inside
 from needletrack.tracking.needle import Needle, Positive, Workspace
@@ -65,14 +62,16 @@ def weaknesses(
     refined: Refined,
     curve: NeedleCurve,
     quality: Quality,
-    rig: StereoRig,
     needle: Needle,
     workspace: Workspace,
     parameters: GateParameters,
     previous: NeedleTrack | None,
+    *,
+    along_epipolar_lines: float,
 ) -> tuple[Reason, ...]:
     """Why a shape is not ok, in the order of `Reason`; empty where it is.
 
+    along_epipolar_lines: share of its length whose picture in the right view runs along them.
     Raises NeedleNotFound for a shape that is no needle of the configured kind and place.
     """
     tip = refined.tip
@@ -85,11 +84,10 @@ def weaknesses(
         <= needle.max_diameter_mm + _SATURATION_MM,
         Reason.AMBIGUOUS_BASE: not refined.base_is_known,
         Reason.LOW_COVERAGE: (quality.coverage or 0.0) < parameters.min_coverage,
-        Reason.ALONG_EPIPOLAR_LINES: _share_along_epipolar_lines(curve.points_mm, rig, parameters.epipolar_angle_deg)
-        > parameters.max_epipolar_share,
+        Reason.ALONG_EPIPOLAR_LINES: along_epipolar_lines > parameters.max_epipolar_share,
         Reason.HIGH_RESIDUAL: refined.fit.rms_px > parameters.max_reprojection_rms_px
         or refined.fit.streak_misfit > parameters.max_streak_misfit,
-        Reason.HIGH_UNCERTAINTY: float(np.percentile(curve.sigma_mm, 95)) > parameters.max_sigma_mm
+        Reason.HIGH_UNCERTAINTY: _percentile_95(curve.sigma_mm) > parameters.max_sigma_mm
         or float(np.sqrt(np.linalg.eigvalsh(refined.tip_covariance_mm2)[-1])) > parameters.max_sigma_mm,
         Reason.TIP_NOT_SEEN: min(tip.contrast) < parameters.min_tip_contrast or not refined.tip_is_free,
         Reason.TIP_DISAGREES: abs(tip.each_mm[0] - tip.each_mm[1]) > parameters.max_tip_disagreement_mm
@@ -105,11 +103,6 @@ def weaknesses(
     return tuple(reason for reason in Reason if found.get(reason, False))
 
 
-def _share_along_epipolar_lines(points_mm: Float, rig: StereoRig, angle_deg: float) -> float:
-    """Share of the length whose picture in the right view runs along the epipolar lines."""
-    left_px, right_px = rig.project(points_mm)
-    lines = epipolar_lines(rig.fundamental, rig.left.undistort(left_px))
-    along = tangents(rig.right.undistort(right_px))
-    # A line a x + b y + c = 0 of unit (a, b) runs along (b, -a): its normal's product with the tangent is the sine.
-    sine = np.abs((lines[:, :2] * along).sum(axis=1))
-    return float(np.mean(sine < np.sin(np.radians(angle_deg))))
+def _percentile_95(values: Float) -> float:
+    """The 95th percentile of values (N,): the least that at least so many of them do not exceed."""
+    return float(np.partition(values, -(-19 * len(values) // 20) - 1)[-(-19 * len(values) // 20) - 1])

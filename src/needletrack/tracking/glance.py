@@ -6,20 +6,21 @@ it, a fit, its tip, and the fit once more to the tip tell all that there is. It 
 """
 
 import ctypes
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
 from needletrack.errors import NeedleNotFound
-from needletrack.geometry.spline import tangents, unit
 from needletrack.geometry.stereo import StereoRig
 from needletrack.kernels import Array, address, call, two_tip_views
 from needletrack.records import Appearance, Float, Image, Reason
 from needletrack.tracking.adjust import MOVED
 from needletrack.tracking.beside import BesideParameters
+from needletrack.tracking.clipped import CLIPPED_GRAY, WORTH_A_LOOK
 from needletrack.tracking.ends import (
     CROSSED_MM,
     EDGE_GAP_MM,
@@ -83,7 +84,7 @@ _MOST_CONTROL = 30
 # The tip shows its angle to the line of sight over so many points.
 _TIP_POINTS = 8
 # What the kernel says; 0: found.
-_FOUND, _BEYOND = 0, 1
+_FOUND, _BEYOND, _CLIPPED = 0, 1, 7
 _LOST = {
     2: Reason.LOW_COVERAGE,
     3: Reason.HIGH_UNCERTAINTY,
@@ -109,8 +110,7 @@ class GlanceParameters:
 class Steady:
     """A needle that was seen whole in the pair before: its curve (N, 3), what it looked like, how its tip is shaped.
 
-    since_s: how long ago that was; advance_mm: how far its tip comes in that time. is_due: what it looks like is found
-    anew.
+    since_s: how long ago that was; advance_mm: how far its tip comes in that time.
     """
 
     points_mm: Float
@@ -118,7 +118,6 @@ class Steady:
     taper_mm: float
     since_s: float
     advance_mm: float
-    is_due: bool
 
 
 @dataclass(frozen=True, slots=True)
@@ -137,9 +136,9 @@ class Glance:
 
 
 def glance(images: Images, rig: StereoRig, steady: Steady, parameters: GlanceParameters) -> Glance | None:
-    """The needle where it was moved to since; None where its tip lies beyond what was looked at.
+    """The needle where it was moved to since; raises NeedleNotFound where the views do not show it.
 
-    Raises NeedleNotFound where the views do not show it.
+    None where its tip lies beyond what was looked at, or where it is so bright that it is white.
     """
     shaft = replace(steady.appearance, taper_mm=None)
     wanted, kept = _wanted(parameters, shaft)
@@ -157,15 +156,16 @@ def glance(images: Images, rig: StereoRig, steady: Steady, parameters: GlancePar
         eye.image, eye.rows, eye.columns, eye.stride = address(contiguous), *contiguous.shape, contiguous.shape[1]
         eye.own, eye.posed = address(camera.lens), address(lens)
         last_mm = points_mm[-_TIP_POINTS:] if pose is None else pose.apply(points_mm[-_TIP_POINTS:])
-        toward = float(np.median(np.abs((unit(last_mm) * tangents(last_mm)).sum(axis=1))))
-        sine = stepped(float(np.sqrt(max(0.0, 1 - toward**2))))
+        along, sight = last_mm[-1] - last_mm[0], last_mm[-1]
+        toward = float(along @ sight) ** 2 / float((along @ along) * (sight @ sight))
+        sine = stepped(math.sqrt(max(0.0, 1 - toward)))
         pictures = inside_pictures(steady.taper_mm, shaft, unit_mm(parameters.needle), sine, None)
         pictures.lay_out(view, 0)
         kept = (*kept, contiguous, pictures.parts, pictures.own, pictures.there)
     room = len(points_mm) + round((MOST_ADVANCE_MM + 2 * _BEYOND_MM) / parameters.spacing_mm) + 16
     found = _Room(room)
     answer = call("glance", now, eyes, views, found.record)
-    if answer == _BEYOND:
+    if answer in (_BEYOND, _CLIPPED):
         return None
     if answer in _LOST:
         raise NeedleNotFound("glance", _LOST[answer])
@@ -180,7 +180,7 @@ _P, _I, _D = ctypes.c_void_p, ctypes.c_int64, ctypes.c_double
 class _Eye(ctypes.Structure):
     """One view, as `glance.c` lays it out."""
 
-    _fields_: Sequence[tuple[str, Any]] = [
+    _fields_: ClassVar[Sequence[tuple[str, Any]]] = [
         ("image", _P),
         ("rows", _I),
         ("columns", _I),
@@ -193,12 +193,14 @@ class _Eye(ctypes.Structure):
 class _Glance(ctypes.Structure):
     """What is known and wanted, as `glance.c` lays it out."""
 
-    _fields_: Sequence[tuple[str, Any]] = [
+    _fields_: ClassVar[Sequence[tuple[str, Any]]] = [
         ("before_mm", _P),
         ("before", _I),
         ("advance_mm", _D),
         ("taper_mm", _D),
         ("since_s", _D),
+        ("white_gray", _D),
+        ("white_share", _D),
         ("spacing_mm", _D),
         ("most_advance_mm", _D),
         ("beyond_mm", _D),
@@ -282,7 +284,7 @@ class _Glance(ctypes.Structure):
 class _Found(ctypes.Structure):
     """What was found, as `glance.c` lays it out."""
 
-    _fields_: Sequence[tuple[str, Any]] = [
+    _fields_: ClassVar[Sequence[tuple[str, Any]]] = [
         ("room", _I),
         ("most_control", _I),
         ("count", _I),
@@ -361,12 +363,14 @@ def _wanted(parameters: GlanceParameters, appearance: Appearance) -> tuple[_Glan
         kept.append(each)
     prior, log_prior = prior_of_parts()
 
-    def at(array: Array) -> int | None:
+    def at(array: Array) -> int:
         kept.append(array)
         return address(array)
 
     none_bank = no_needle_bank(blur)
     return _Glance(
+        white_gray=CLIPPED_GRAY,
+        white_share=WORTH_A_LOOK,
         spacing_mm=parameters.spacing_mm,
         most_advance_mm=MOST_ADVANCE_MM,
         beyond_mm=_BEYOND_MM,

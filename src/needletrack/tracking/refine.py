@@ -4,6 +4,7 @@ Works the same from a detection and from the previous track: it needs nothing bu
 """
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
@@ -11,13 +12,12 @@ from scipy.ndimage import uniform_filter1d
 
 from needletrack.errors import NeedleNotFound
 from needletrack.geometry.camera import Camera
-from needletrack.geometry.spline import arc_length, resample, unit
+from needletrack.geometry.spline import arc_length, resample, spline_basis, unit
 from needletrack.geometry.stereo import StereoRig
 from needletrack.geometry.transform import RigidTransform
 from needletrack.records import Appearance, Float, NeedleTrack, Reason
 from needletrack.tracking.adjust import GROWING, MOVED, ROUGH, SETTLED, Adjusted, Images, adjust
 from needletrack.tracking.beside import Beside, BesideParameters, look_beside
-from needletrack.tracking.clipped import WORTH_A_LOOK, clipped_share
 from needletrack.tracking.ends import (
     TIP_BEFORE_MM,
     TIP_BEYOND_MM,
@@ -48,7 +48,6 @@ from needletrack.tracking.tip import (
     BEFORE_MM,
     BEYOND_MM,
     ROW_MM,
-    TRIED_AGAIN_MM,
     TRIED_MM,
     TipFit,
     TipParameters,
@@ -63,8 +62,6 @@ WIDTH_ALLOWANCE = 1.4
 _MOST_ODDS = 30.0
 # And once more where it was not within this of the end of the curve.
 _TIP_MOVED_MM = 0.3
-# What a needle that is followed looks like is found anew once in so many pairs.
-_PAIRS_PER_APPEARANCE = 8
 # Less than so much that looks like more of a needle beyond an end is none.
 _GOES_ON_MM = 1.5
 # Images without stamps are of a sequence as fast as cameras are.
@@ -107,7 +104,7 @@ class RefineModels:
     refine: RefineParameters
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, eq=False)
 class Refined:
     """The needle's curve, base -> tip where base_is_known, and what it rests on.
 
@@ -129,13 +126,14 @@ class Refined:
     log_odds: float
     calibration_mm2: Float | None = None
 
-    @property
+    @cached_property
     def tip_covariance_mm2(self) -> Float:
         """Covariance (3, 3) of the tip: across the needle that of the curve, along it that of the end's picture."""
-        along = unit(self.fit.derivative(1)[-1])
+        at_tip = spline_basis(self.fit.parameters[-1:], len(self.fit.control_mm), derivative=1)
+        along = unit(at_tip.curve(self.fit.control_mm)[0])
         left, right = self.tip.each_mm
         along_mm = np.hypot(np.sum(np.array(self.tip.sigma_mm) ** -2.0) ** -0.5, abs(left - right) / 2)
-        covariance = self.fit.point_covariance_mm2()[-1] + along_mm**2 * np.outer(along, along)
+        covariance = self.fit.point_covariance_mm2[-1] + along_mm**2 * np.outer(along, along)
         if self.calibration_mm2 is not None:
             covariance = covariance + self.calibration_mm2[-1]
         return np.asarray((covariance + covariance.T) / 2)
@@ -155,11 +153,7 @@ def refine(
     previous: the track of the pair before, whose curve this is, which is then nearly right and tells base from tip
     where no sleeve is seen; without it the curve is a rough one. since_s: how long ago it was taken; 0: nobody knows.
     """
-    steady = _steady(previous, since_s, models.needle)
-    if steady is not None and not steady.is_due and clipped_share(images, rig, steady.points_mm).max() < WORTH_A_LOOK:
-        refined = _glanced(images, rig, steady, models)
-        if refined is not None:
-            return refined
+    steady = None if previous is None or set(previous.reasons) - _STEADY_DESPITE else _steady(previous, since_s, models)
     if steady is None:
         followed = _follow(images, rig, points_mm, models, previous)
     else:
@@ -213,11 +207,17 @@ class _Ended:
     ends: Ends
 
 
-def _glanced(images: Images, rig: StereoRig, steady: Steady, models: RefineModels) -> Refined | None:
-    """The needle where it was moved to since, looked at once: what it looks like and where its base is are known.
+def glanced(
+    images: Images, rig: StereoRig, models: RefineModels, *, previous: NeedleTrack, since_s: float
+) -> Refined | None:
+    """The needle where it has moved since the pair before, looked at once: a hundredth of what `refine` takes.
 
-    None where its tip lies beyond what was looked at.
+    What it looks like and where its base is are known. None where one look does not do: its tip is not where it may be,
+    it was not seen whole, or it is white. Raises NeedleNotFound where the views do not show it.
     """
+    steady = _steady(previous, since_s, models)
+    if steady is None:
+        return None
     seen = glance(
         images,
         rig,
@@ -231,7 +231,7 @@ def _glanced(images: Images, rig: StereoRig, steady: Steady, models: RefineModel
         seen.shown,
         steady.appearance,
         diameter_mm(steady.appearance, models.needle),
-        True,
+        Reason.AMBIGUOUS_BASE not in previous.reasons,
         seen.tip,
         seen.tip_is_free,
         seen.tip_px,
@@ -299,8 +299,6 @@ def _tip(
 ) -> tuple[TipFit, Float]:
     """The tip, and the curve (N, 3) on which it lies, from the base to well beyond it."""
     needle, tried_mm = models.needle, TRIED_MM
-    if steady is not None and not steady.is_due:
-        needle, tried_mm = needle.model_copy(update={"tip_tapers_mm": (steady.taper_mm,)}), TRIED_AGAIN_MM
     spacing = models.refine.spacing_mm
     along = np.concatenate([curve, _beyond(curve, round(TIP_REACH_MM / spacing), spacing)])
     arc = arc_length(along)
@@ -375,14 +373,12 @@ def _tip_px(view: AxisOffsets, end: EndObservation) -> Float:
     return np.asarray(view.center_px[-1] + view.offset_px[-1] * normal + end.shift_px * along)
 
 
-def _steady(previous: NeedleTrack | None, since_s: float, needle: Needle) -> Steady | None:
-    """What the track before tells, where it can be relied on."""
-    if previous is None or previous.curve is None or previous.appearance is None:
-        return None
-    if not set(previous.reasons) <= _STEADY_DESPITE or previous.doubts:
+def _steady(previous: NeedleTrack, since_s: float, models: RefineModels) -> Steady | None:
+    """What the track before tells, where it tells enough."""
+    if previous.curve is None or previous.appearance is None:
         return None
     taper_mm, tip = previous.appearance.taper_mm, previous.tip
-    if taper_mm is None or taper_mm not in needle.tip_tapers_mm:
+    if taper_mm is None or taper_mm not in models.needle.tip_tapers_mm:
         return None
     return Steady(
         previous.curve.points_mm,
@@ -390,7 +386,6 @@ def _steady(previous: NeedleTrack | None, since_s: float, needle: Needle) -> Ste
         taper_mm,
         since_s if since_s > 0 else _USUAL_S,
         0.0 if tip is None or tip.velocity_mm_s is None else float(tip.velocity_mm_s @ tip.direction) * since_s,
-        previous.since_detection % _PAIRS_PER_APPEARANCE == _PAIRS_PER_APPEARANCE - 1,
     )
 
 
@@ -410,7 +405,6 @@ def _moved(images: Images, rig: StereoRig, steady: Steady, models: RefineModels)
         models.fit,
         steady.appearance,
         looks=MOVED,
-        looks_the_same=not steady.is_due,
         bent_for_s=steady.since_s,
     )
 

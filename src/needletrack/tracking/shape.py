@@ -6,9 +6,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from needletrack.geometry.epipolar import sampson_distance_px
-from needletrack.geometry.spline import arc_length, curvature, unit
+from needletrack.geometry.spline import arc_length, spline_basis, unit
 from needletrack.geometry.stereo import StereoRig
 from needletrack.geometry.transform import orientation_along
+from needletrack.kernels import call
 from needletrack.records import (
     BasePose,
     Evidence,
@@ -20,7 +21,6 @@ from needletrack.records import (
     Status,
     TipPose,
 )
-from needletrack.tracking.fit import CurveFit
 from needletrack.tracking.gates import weaknesses
 from needletrack.tracking.parameters import TrackingParameters
 from needletrack.tracking.refine import Refined
@@ -57,13 +57,25 @@ def judged(refined: Refined, rig: StereoRig, parameters: TrackingParameters, pre
     seen = refined.shown
     # One error for all points of all pairs: it does not average out along the needle.
     refined = replace(refined, calibration_mm2=rig.calibration_covariance_mm2(fit.points_mm))
-    curve = NeedleCurve(
-        fit.points_mm,
-        _sigma_across_mm(fit, refined.calibration_mm2),
-        seen.sum(axis=0),
-        curvature(fit.derivative(1), fit.derivative(2)),
-        float(arc_length(fit.points_mm)[-1]),
+    count = len(fit.points_mm)
+    sigma_mm, curvature_per_mm = np.empty((2, count))
+    covariance_mm2 = fit.point_covariance_mm2
+    along_epipolar_lines = call(
+        "told_of_curve",
+        np.ascontiguousarray(fit.control_mm),
+        len(fit.control_mm),
+        np.ascontiguousarray(fit.parameters),
+        np.ascontiguousarray(fit.points_mm),
+        count,
+        covariance_mm2 if refined.calibration_mm2 is None else covariance_mm2 + refined.calibration_mm2,
+        *rig.lenses,
+        rig.fundamental,
+        float(np.sin(np.radians(parameters.gates.epipolar_angle_deg))),
+        sigma_mm,
+        curvature_per_mm,
     )
+    length_mm = float(arc_length(fit.points_mm)[-1])
+    curve = NeedleCurve(fit.points_mm, sigma_mm, seen.sum(axis=0), curvature_per_mm, length_mm)
     left_px = rig.left.undistort(refined.tip_px[[0]])
     right_px = rig.right.undistort(refined.tip_px[[1]])
     quality = Quality(
@@ -72,14 +84,21 @@ def judged(refined: Refined, rig: StereoRig, parameters: TrackingParameters, pre
         float(seen.all(axis=0).mean()),
     )
     reasons = weaknesses(
-        refined, curve, quality, rig, parameters.needle, parameters.workspace, parameters.gates, previous
+        refined,
+        curve,
+        quality,
+        parameters.needle,
+        parameters.workspace,
+        parameters.gates,
+        previous,
+        along_epipolar_lines=along_epipolar_lines,
     )
     return Shape(refined, curve, quality, reasons)
 
 
-def differ(shape: Shape, other: Shape) -> bool:
+def differ(curve: NeedleCurve, other: NeedleCurve) -> bool:
     """Whether two shapes are different ones, and not two fits of one needle."""
-    apart = np.linalg.norm(shape.curve.points_mm[:, None] - other.curve.points_mm[None], axis=2).min(axis=1)
+    apart = np.linalg.norm(curve.points_mm[:, None] - other.points_mm[None], axis=2).min(axis=1)
     return float(np.median(apart)) > _SAME_SHAPE_MM
 
 
@@ -93,7 +112,8 @@ def as_track(
 ) -> NeedleTrack:
     """The track to publish: without a tip where the free end was not found, for a curve's end is not yet a tip."""
     fit, points_mm = shape.refined.fit, shape.curve.points_mm
-    along = np.stack([unit(fit.derivative(1)[0]), _tip_direction(points_mm)])
+    at_base = spline_basis(fit.parameters[:1], len(fit.control_mm), derivative=1)
+    along = np.stack([unit(at_base.curve(fit.control_mm)[0]), _tip_direction(shape.curve)])
     tip = None
     if Reason.TIP_NOT_SEEN not in shape.reasons:
         tip = TipPose(
@@ -121,34 +141,22 @@ def as_track(
     )
 
 
-def _tip_direction(points_mm: Float) -> Float:
+def _tip_direction(curve: NeedleCurve) -> Float:
     """Unit direction (3,) out of the tip: of a parabola through the last stretch, the tip's own taper left out.
 
     What shows there is thin and faint: the spline's own end is twice as far off.
     """
+    points_mm = curve.points_mm
     arc = arc_length(points_mm)
     before = arc - arc[-1]
     # A parabola follows a needle's turn over about half a radian.
-    turn = curvature(np.gradient(points_mm, arc, axis=0), np.gradient(np.gradient(points_mm, arc, axis=0), arc, axis=0))
-    bend = float(np.median(turn[before >= -_DIRECTION_MM]))
+    bend = float(np.median(curve.curvature_per_mm[before >= -_DIRECTION_MM]))
     length_mm = min(_DIRECTION_MM - _DIRECTION_SKIP_MM, max(_LEAST_DIRECTION_MM, _PARABOLA_RAD / max(bend, 1e-6)))
     last = (before >= -_DIRECTION_SKIP_MM - length_mm) & (before <= -_DIRECTION_SKIP_MM)
     if last.sum() < 5:
         return unit(points_mm[-1] - points_mm[-2])
     design = np.vander(before[last], 3, increasing=True)
     return unit(np.linalg.lstsq(design, points_mm[last], rcond=None)[0][1])
-
-
-def _sigma_across_mm(fit: CurveFit, calibration_mm2: Float | None) -> Float:
-    """Square root (N,) of the larger eigenvalue of each point's covariance across the tangent.
-
-    calibration_mm2 (N, 3, 3): the calibration's share, where it is known.
-    """
-    along = unit(fit.derivative(1))
-    across = np.eye(3) - along[:, :, None] * along[:, None, :]
-    of_points = fit.point_covariance_mm2()
-    flattened = across @ (of_points if calibration_mm2 is None else of_points + calibration_mm2) @ across
-    return np.asarray(np.sqrt(np.maximum(np.linalg.eigvalsh(flattened)[:, -1], 1e-12)))
 
 
 def _velocity_mm_s(tip_mm: Float, captured_at_ns: int, previous: NeedleTrack | None) -> Float | None:

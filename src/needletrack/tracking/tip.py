@@ -35,7 +35,7 @@ TRIED_AGAIN_MM = (-1.8, 2.4)
 _COARSE_MM, _FINE_MM, _FINE_REACH_MM = 0.3, 0.05, 0.6
 # A view places the apex along the needle this far from where it is: the curve is not quite right, nor is a picture.
 _VIEW_SIGMA_MM = 0.1
-ACROSS = np.arange(-6.5, 6.51, 0.5)
+ACROSS = np.arange(-6.75, 6.76, 0.5)
 # Parts of the inside across the needle; spacing of the pictures of them along it, mm.
 _PARTS = 5
 PICTURE_MM = 0.05

@@ -1,33 +1,36 @@
 """One stereo pair, and the track before it, to one needle track: every stage in order.
 
-detect (segment -> centerline -> match, triangulating) -> refine (axis, fit, ends) -> gates. With a previous track,
-detection is skipped as long as refinement from where the needle was holds.
+Search: detect (segment -> centerline -> match, triangulating) -> refine (axis, fit, ends) -> gates. With a previous
+track the needle is followed: one glance at where it must be -> gates. Once in a few pairs what is followed is audited
+by what a search finds; where cameras are faster than that, the audit may be of a pair a little before.
 """
+
+from dataclasses import replace
 
 import numpy as np
 
 from needletrack.errors import NeedleNotFound
 from needletrack.geometry.spline import distance_from_curve, unit
 from needletrack.geometry.stereo import StereoRig
-from needletrack.records import Evidence, Frame, Image, NeedleTrack, Reason, Status, StereoPair
+from needletrack.records import Evidence, Float, Frame, Image, NeedleTrack, Reason, Status, StereoPair
 from needletrack.tracking.adjust import Images
 from needletrack.tracking.detect import detect
 from needletrack.tracking.fit import initial_curve
 from needletrack.tracking.match import Candidate
 from needletrack.tracking.parameters import TrackingParameters
-from needletrack.tracking.refine import RefineModels, refine
+from needletrack.tracking.refine import RefineModels, glanced, refine
 from needletrack.tracking.shape import Shape, as_track, differ, judged
 from needletrack.tracking.stopwatch import Stopwatch
 
 # Candidates this close to the best one in score are examined as well: two that hold make the shape ambiguous.
 _RIVAL_SHARE = 0.4
-# A weak track is searched for anew once in so many pairs, sooner where its shape is in doubt; one that holds is not.
-_PAIRS_PER_SEARCH = 15
-_PAIRS_PER_SEARCH_IN_DOUBT = 5
+# What is followed is audited once in so many pairs.
+PAIRS_PER_AUDIT = 6
+# A detected line is of the shape that is followed where this share of it lies within so many pixels of it.
+_CONFIRMED_SHARE, _CONFIRMED_PX = 0.5, 5.0
 # What is detected so near to a tip, not behind it, and so long may be more of the needle: the far side of a hook.
 _GOES_ON_WITHIN_MM, _GOES_ON_COSINE, _GOES_ON_MM = 40.0, -0.3, 4.0
 _APART_PX = 8.0
-_IN_DOUBT = {Reason.AMBIGUOUS_BASE, Reason.LOW_COVERAGE, Reason.HIGH_RESIDUAL, Reason.HIGH_UNCERTAINTY}
 
 
 def track(
@@ -53,57 +56,160 @@ def track_pair(
     not have the rig's size.
     """
     parameters = parameters or TrackingParameters()
-    images = (pair.left.image, pair.right.image)
-    for image, camera, side in zip(images, (rig.left, rig.right), ("left", "right"), strict=True):
-        if image.shape != camera.size_px[::-1]:
-            raise ValueError(f"the {side} image is {image.shape[1]}x{image.shape[0]}, the rig says {camera.size_px}")
-    stopwatch = Stopwatch()
-    followed = _followed(images, rig, parameters, previous, pair.captured_at_ns, stopwatch)
-    if previous is not None and followed is not None:
-        since = previous.since_detection + 1
-        return as_track(followed, pair.captured_at_ns, previous, since, Evidence(), stopwatch.elapsed_ms)
-    try:
-        shape, found = _searched(images, rig, parameters, previous, stopwatch)
-    except NeedleNotFound as lost:
-        return NeedleTrack(pair.captured_at_ns, Status.INVALID, (Reason(lost.reason),), timing_ms=stopwatch.elapsed_ms)
-    evidence = Evidence(found.left, found.right, found.correspondences)
-    return as_track(shape, pair.captured_at_ns, previous, 0, evidence, stopwatch.elapsed_ms)
+    followed = None if previous is None else follow(pair, rig, parameters, previous)
+    if followed is None:
+        return search(pair, rig, parameters, previous)
+    if followed.since_detection < PAIRS_PER_AUDIT:
+        return followed
+    return adopted(followed, audit(pair, rig, parameters, followed))
 
 
-def _followed(
-    images: Images,
-    rig: StereoRig,
-    parameters: TrackingParameters,
-    previous: NeedleTrack | None,
-    captured_at_ns: int,
-    stopwatch: Stopwatch,
-) -> Shape | None:
-    """The needle refined from where it was, or None where that does not hold or a search is due."""
-    if previous is None or previous.curve is None:
+def follow(
+    pair: StereoPair, rig: StereoRig, parameters: TrackingParameters, previous: NeedleTrack
+) -> NeedleTrack | None:
+    """The needle of the pair before in this one; None where it is not seen where it must be: it has to be searched for.
+
+    Raises ValueError where the images do not have the rig's size.
+    """
+    images = _images(pair, rig)
+    if previous.curve is None:
         return None
+    stopwatch = Stopwatch()
     try:
         with stopwatch("refine"):
-            points_mm = previous.curve.points_mm
-            since_s = (captured_at_ns - previous.captured_at_ns) * 1e-9
-            refined = refine(images, rig, points_mm, _models(parameters), previous=previous, since_s=since_s)
+            models, since_s = _models(parameters), (pair.captured_at_ns - previous.captured_at_ns) * 1e-9
+            refined = glanced(images, rig, models, previous=previous, since_s=since_s)
+            if refined is None:
+                points_mm = previous.curve.points_mm
+                refined = refine(images, rig, points_mm, models, previous=previous, since_s=since_s)
             shape = judged(refined, rig, parameters, previous).doubted(previous.doubts)
     except NeedleNotFound:
         # Lost is not yet gone: the search that follows decides, and its reason is the one that is told.
         return None
-    allowed = _PAIRS_PER_SEARCH_IN_DOUBT if _IN_DOUBT & set(shape.reasons) or shape.doubts else _PAIRS_PER_SEARCH
-    return shape if not shape.reasons or previous.since_detection + 1 < allowed else None
+    since = previous.since_detection + 1
+    return as_track(shape, pair.captured_at_ns, previous, since, Evidence(), stopwatch.elapsed_ms)
 
 
-def _searched(
+def search(
+    pair: StereoPair, rig: StereoRig, parameters: TrackingParameters, previous: NeedleTrack | None = None
+) -> NeedleTrack:
+    """The needle in the whole images, wherever it was; raises ValueError where they do not have the rig's size."""
+    images, stopwatch = _images(pair, rig), Stopwatch()
+    try:
+        candidates = detect(images, rig, parameters, stopwatch)
+        shape, found = _best(candidates, [], images, rig, parameters, previous, stopwatch)
+        if _may_go_on(shape, candidates, rig):
+            shape = shape.doubted([Reason.TIP_NOT_SEEN])
+    except NeedleNotFound as lost:
+        return NeedleTrack(pair.captured_at_ns, Status.INVALID, (Reason(lost.reason),), timing_ms=stopwatch.elapsed_ms)
+    evidence = Evidence() if found is None else Evidence(found.left, found.right, found.correspondences)
+    return as_track(shape, pair.captured_at_ns, previous, 0, evidence, stopwatch.elapsed_ms)
+
+
+def audit(pair: StereoPair, rig: StereoRig, parameters: TrackingParameters, followed: NeedleTrack) -> NeedleTrack:
+    """What a second, thorough look at a pair makes of the track that was followed to it.
+
+    That track as it is seen without haste, another one that explains the whole images better, or the same with doubts:
+    of what nothing else confirms. Raises ValueError where the images do not have the rig's size.
+    """
+    if followed.curve is None:
+        raise ValueError("there is no shape to audit")
+    images, stopwatch = _images(pair, rig), Stopwatch()
+    own: list[tuple[Shape, Candidate | None]] = []
+    try:
+        with stopwatch("refine"):
+            refined = refine(images, rig, followed.curve.points_mm, _models(parameters), previous=followed)
+            own = [(judged(refined, rig, parameters, None), None)]
+    except NeedleNotFound:
+        pass
+    try:
+        candidates = detect(images, rig, parameters, stopwatch)
+    except NeedleNotFound:
+        candidates = []
+    curve_mm = own[0][0].curve.points_mm if own else followed.curve.points_mm
+    of_it = [_is_of(candidate, curve_mm, rig) for candidate in candidates]
+    confirming = max((c.score for c, mine in zip(candidates, of_it, strict=True) if mine), default=0.0)
+    holds = bool(own) and not own[0][0].reasons
+    # A shape that holds is compared with what was detected more clearly than itself; one that does not, with all.
+    rivals = [
+        c
+        for c, mine in zip(candidates, of_it, strict=True)
+        if not (mine and own) and not (holds and c.score < confirming)
+    ]
+    try:
+        shape, _ = _best(rivals, own, images, rig, parameters, None, stopwatch)
+    except NeedleNotFound:
+        return with_doubts(followed, (Reason.AMBIGUOUS_SHAPE,))
+    if not any(_is_of(candidate, shape.curve.points_mm, rig) for candidate in candidates):
+        shape = shape.doubted([Reason.AMBIGUOUS_SHAPE])
+    elif _may_go_on(shape, candidates, rig):
+        shape = shape.doubted([Reason.TIP_NOT_SEEN])
+    track = as_track(shape, pair.captured_at_ns, None, 0, Evidence(), stopwatch.elapsed_ms)
+    if track.tip is None or followed.tip is None or _differ(track, followed):
+        return track
+    return replace(track, tip=replace(track.tip, velocity_mm_s=followed.tip.velocity_mm_s))
+
+
+def adopted(now: NeedleTrack, audited: NeedleTrack) -> NeedleTrack:
+    """The track to go on from, of what has been followed until now and what an audit made of it at its own time.
+
+    What an audit of a pair before found in the same place lends its looks and doubts; what it found elsewhere is gone
+    on from instead.
+    """
+    if audited.captured_at_ns == now.captured_at_ns:
+        return replace(audited, timing_ms={**now.timing_ms, **audited.timing_ms})
+    if audited.curve is None or now.curve is None or _differ(audited, now):
+        return audited
+    doubted = with_doubts(now, audited.doubts)
+    return replace(doubted, appearance=audited.appearance, diameter_mm=audited.diameter_mm, since_detection=0)
+
+
+def with_doubts(track: NeedleTrack, doubts: tuple[Reason, ...]) -> NeedleTrack:
+    """The track with these doubts, and no others."""
+    both = (set(track.reasons) - set(track.doubts)) | set(doubts)
+    reasons = tuple(reason for reason in Reason if reason in both)
+    return replace(
+        track,
+        status=Status.DEGRADED if reasons or track.tip is None else Status.OK,
+        reasons=reasons or (() if track.tip is not None else (Reason.TIP_NOT_SEEN,)),
+        tip=None if Reason.TIP_NOT_SEEN in reasons else track.tip,
+        doubts=doubts,
+        since_detection=0,
+    )
+
+
+def _images(pair: StereoPair, rig: StereoRig) -> Images:
+    images = (pair.left.image, pair.right.image)
+    for image, camera, side in zip(images, (rig.left, rig.right), ("left", "right"), strict=True):
+        if image.shape != camera.size_px[::-1]:
+            raise ValueError(f"the {side} image is {image.shape[1]}x{image.shape[0]}, the rig says {camera.size_px}")
+    return images
+
+
+def _differ(track: NeedleTrack, other: NeedleTrack) -> bool:
+    return track.curve is None or other.curve is None or differ(track.curve, other.curve)
+
+
+def _is_of(candidate: Candidate, points_mm: Float, rig: StereoRig) -> bool:
+    """Whether a candidate is of a curve (N, 3), as both views show it."""
+    apart = [
+        distance_from_curve(other, own)
+        for other, own in zip(rig.project(candidate.points_mm), rig.project(points_mm), strict=True)
+    ]
+    return float((np.max(apart, axis=0) < _CONFIRMED_PX).mean()) > _CONFIRMED_SHARE
+
+
+def _best(
+    candidates: list[Candidate],
+    known: list[tuple[Shape, Candidate | None]],
     images: Images,
     rig: StereoRig,
     parameters: TrackingParameters,
     previous: NeedleTrack | None,
     stopwatch: Stopwatch,
-) -> tuple[Shape, Candidate]:
-    """The best shape that the whole images hold, and what it was detected as; raises NeedleNotFound."""
-    candidates = detect(images, rig, parameters, stopwatch)
-    found: list[tuple[Shape, Candidate]] = []
+) -> tuple[Shape, Candidate | None]:
+    """The best of the shapes that are known and that candidates lead to; raises NeedleNotFound where there is none."""
+    found = [*known]
     lost: list[NeedleNotFound] = []
     for candidate in candidates:
         # What is much worse matched is examined only for want of a shape that holds.
@@ -119,21 +225,19 @@ def _searched(
         except NeedleNotFound as error:
             lost.append(error)
     if not found:
-        raise lost[0]
+        raise lost[0] if lost else NeedleNotFound("track", Reason.NO_STEREO_MATCH)
     # What begins at a sleeve is a needle rather than what is longer: vessels and rods are long.
-    best, candidate = min(
+    best, led_to = min(
         found,
         key=lambda each: (
             bool(each[0].reasons),
             Reason.AMBIGUOUS_BASE in each[0].reasons,
-            -each[0].refined.log_odds * each[1].plausible,
+            -each[0].refined.log_odds * (1.0 if each[1] is None else each[1].plausible),
         ),
     )
-    if not best.reasons and any(not shape.reasons and differ(shape, best) for shape, _ in found):
+    if not best.reasons and any(not shape.reasons and differ(shape.curve, best.curve) for shape, _ in found):
         best = best.doubted([Reason.AMBIGUOUS_SHAPE])
-    if _may_go_on(best, candidates, rig):
-        best = best.doubted([Reason.TIP_NOT_SEEN])
-    return best, candidate
+    return best, led_to
 
 
 def _may_go_on(shape: Shape, candidates: list[Candidate], rig: StereoRig) -> bool:

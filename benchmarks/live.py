@@ -21,9 +21,10 @@ import numpy as np
 import psutil
 
 from benchmarks.threads import one_thread
+from needletrack.auditing import AuditedTracker
 from needletrack.config import load_config
 from needletrack.daemon.process import settle_memory
-from needletrack.daemon.run import RecordedSource, tracker_of, warm_up
+from needletrack.daemon.run import RecordedSource, warm_up
 from needletrack.publish.message import RunContext, Source, TrackMessage, WireRecording
 from needletrack.publish.publisher import ZenohPublisher
 from needletrack.recording.mcap_file import About
@@ -152,7 +153,7 @@ def under_load(recording: Path, rate_hz: float, seconds: float, *, record: Path 
     pairs = [stored.read(index) for index in range(len(stored))]
     rig = stored.rig
     context = RunContext(rig.name, Source.LIVE, config.digest, rig.digest)
-    tracker = tracker_of(rig, config) if track else _nothing
+    audited = AuditedTracker(rig, config.tracking) if track else None
     source = MemorySource(pairs, rate_hz, seconds)
     figures, stop = Figures(), threading.Event()
     with ExitStack() as opened:
@@ -162,15 +163,20 @@ def under_load(recording: Path, rate_hz: float, seconds: float, *, record: Path 
             settings = RecorderSettings(folder, max_file_mb=_FILE_MB)
             recorder = opened.enter_context(Recorder(settings, About(rig, rig.name), rig.left.size_px))
         recorded_source = source if recorder is None else RecordedSource(source, recorder)
-        service = Service(recorded_source, tracker, rig, context, surroundings=lambda: _surroundings(recorder))
+        if audited is not None:
+            opened.enter_context(audited)
+        service = Service(
+            recorded_source, audited or _nothing, rig, context, surroundings=lambda: _surroundings(recorder)
+        )
         with socket.socket() as probe:
             probe.bind(("127.0.0.1", 0))
             endpoint = f"tcp/127.0.0.1:{probe.getsockname()[1]}"
         publisher = opened.enter_context(ZenohPublisher(context, service.status, listen=[endpoint]))
         report = folder / "received.json"
         watching = _subscriber(rig.name, endpoint, report)
-        warm_up(tracker, rig)
-        tracker(pairs[0], None)
+        if audited is not None:
+            warm_up(audited, rig)
+            audited(pairs[0], None)
         settle_memory()
         assert publisher.wait_for_subscriber(_SUBSCRIBED_WITHIN_S)
         probe_ = opened.enter_context(_MemoryProbe(recorder, folder))

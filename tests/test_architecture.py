@@ -29,6 +29,7 @@ FLOORS: dict[str, float] = {
     "recording": 3.5,
     "client": 3.5,
     "scoring": 3.5,
+    "auditing": 3.6,
     "service": 4.0,
     "guidance": 4.1,
     "watch": 4.1,

@@ -9,6 +9,7 @@ from pathlib import Path
 from threading import Event
 from typing import Literal
 
+from needletrack.auditing import AuditedTracker
 from needletrack.config import Config
 from needletrack.publish.message import RunContext, Source, TrackMessage
 from needletrack.publish.publisher import ZenohPublisher
@@ -20,7 +21,6 @@ from needletrack.records import NeedleTrack, StereoPair
 from needletrack.rig import Rig, find_rig, import_camchain, read_rig
 from needletrack.service import RunSummary, Service, Sink, Tracker
 from needletrack.tracking.reference import track_reference
-from needletrack.tracking.track import track_pair
 
 _log = logging.getLogger(__name__)
 
@@ -99,6 +99,8 @@ class Replay:
         if self._paced:
             self.warm_up()
         with ExitStack() as opened:
+            if self._paced and isinstance(self._tracker, AuditedTracker):
+                opened.enter_context(self._tracker).warm_up()
             into: list[Sink] = []
             # Opened before the endpoint: a file that cannot be written must not be announced on the wire.
             if output is not None:
@@ -144,10 +146,7 @@ def _is_camchain(path: Path) -> bool:
 
 
 def _tracker(method: Method, rig: Rig, config: Config) -> Tracker:
-    def by_curve(pair: StereoPair, previous: NeedleTrack | None) -> NeedleTrack:
-        return track_pair(pair, rig, config.tracking, previous)
-
     def by_reference(pair: StereoPair, previous: NeedleTrack | None) -> NeedleTrack:
         return track_reference(pair, rig)
 
-    return by_reference if method == "reference" else by_curve
+    return by_reference if method == "reference" else AuditedTracker(rig, config.tracking)

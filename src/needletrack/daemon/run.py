@@ -11,6 +11,7 @@ from enum import IntEnum
 
 import numpy as np
 
+from needletrack.auditing import AuditedTracker
 from needletrack.capture.kernel import Kernel
 from needletrack.capture.live import LiveSource
 from needletrack.capture.pairing import SkewReport
@@ -27,8 +28,7 @@ from needletrack.recording.mcap_file import About
 from needletrack.recording.recorder import Recorder, RecorderSettings
 from needletrack.records import DropReason, Frame, NeedleTrack, StereoPair
 from needletrack.rig import Rig
-from needletrack.service import RunSummary, Service, Sink, Surroundings, Tracker
-from needletrack.tracking.track import track_pair
+from needletrack.service import RunSummary, Service, Sink, Surroundings
 
 _log = logging.getLogger(__name__)
 
@@ -107,7 +107,7 @@ class Daemon:
                 self._recorder = Recorder(_recorder_settings(config), self._about(), config.cameras.size_px)
                 opened.callback(self._recorder.close, _RECORDER_ENDS_WITHIN_S)
                 source = RecordedSource(source, self._recorder)
-            tracker = tracker_of(rig, config)
+            tracker = opened.enter_context(AuditedTracker(rig, config.tracking))
             service = self.service = Service(
                 source,
                 tracker,
@@ -222,20 +222,12 @@ class _Pulse:
                 told = True
 
 
-def tracker_of(rig: Rig, config: Config) -> Tracker:
-    """Our method with a rig and its parameters."""
-
-    def tracked(pair: StereoPair, previous: NeedleTrack | None) -> NeedleTrack:
-        return track_pair(pair, rig, config.tracking, previous)
-
-    return tracked
-
-
-def warm_up(tracker: Tracker, rig: Rig) -> None:
+def warm_up(tracker: AuditedTracker, rig: Rig) -> None:
     """Track an empty pair, for nothing: the first call of every library takes a multiple of the next."""
     width, height = rig.left.size_px
     empty = Frame(np.zeros((height, width), np.uint8), 0)
     tracker(StereoPair(empty, empty, 0), None)
+    tracker.warm_up()
 
 
 def require_fit(rig: Rig, config: Config) -> None:

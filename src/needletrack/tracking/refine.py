@@ -208,16 +208,25 @@ class _Ended:
 
 
 def glanced(
-    images: Images, rig: StereoRig, models: RefineModels, *, previous: NeedleTrack, since_s: float
+    images: Images,
+    rig: StereoRig,
+    models: RefineModels,
+    *,
+    previous: NeedleTrack,
+    since_s: float,
+    first_mm: Float | None = None,
 ) -> Refined | None:
     """The needle where it has moved since the pair before, looked at once: a hundredth of what `refine` takes.
 
     What it looks like and where its base is are known. None where one look does not do: its tip is not where it may be,
-    it was not seen whole, or it is white. Raises NeedleNotFound where the views do not show it.
+    it was not seen whole, or it is white. first_mm: the curve (N, 3) to the tip at which a first glance put it already.
+    Raises NeedleNotFound where the views do not show it.
     """
     steady = _steady(previous, since_s, models)
     if steady is None:
         return None
+    if first_mm is not None:
+        steady = replace(steady, points_mm=first_mm, advance_mm=0.0)
     seen = glance(
         images,
         rig,

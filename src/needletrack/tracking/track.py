@@ -57,37 +57,51 @@ def track_pair(
     """
     parameters = parameters or TrackingParameters()
     followed = None if previous is None else follow(pair, rig, parameters, previous)
-    if followed is None:
+    if followed is None or followed.curve is None:
+        # Lost is not yet gone: the search decides, and its reason is the one that is told.
         return search(pair, rig, parameters, previous)
     if followed.since_detection < PAIRS_PER_AUDIT:
         return followed
     return adopted(followed, audit(pair, rig, parameters, followed))
 
 
-def follow(
-    pair: StereoPair, rig: StereoRig, parameters: TrackingParameters, previous: NeedleTrack
-) -> NeedleTrack | None:
-    """The needle of the pair before in this one; None where it is not seen where it must be: it has to be searched for.
+def follow(pair: StereoPair, rig: StereoRig, parameters: TrackingParameters, previous: NeedleTrack) -> NeedleTrack:
+    """The needle of a pair before in this one; invalid where it is not where it must be: it has to be searched for.
 
     Raises ValueError where the images do not have the rig's size.
     """
-    images = _images(pair, rig)
+    images, stopwatch = _images(pair, rig), Stopwatch()
     if previous.curve is None:
-        return None
-    stopwatch = Stopwatch()
+        return NeedleTrack(pair.captured_at_ns, Status.INVALID, previous.reasons)
     try:
         with stopwatch("refine"):
             models, since_s = _models(parameters), (pair.captured_at_ns - previous.captured_at_ns) * 1e-9
             refined = glanced(images, rig, models, previous=previous, since_s=since_s)
+            is_glance = refined is not None
             if refined is None:
                 points_mm = previous.curve.points_mm
                 refined = refine(images, rig, points_mm, models, previous=previous, since_s=since_s)
-            shape = judged(refined, rig, parameters, previous).doubted(previous.doubts)
-    except NeedleNotFound:
-        # Lost is not yet gone: the search that follows decides, and its reason is the one that is told.
-        return None
+            shape = judged(refined, rig, parameters, previous)
+            if shape.reasons and is_glance:
+                shape = _looked_at_twice(shape, images, rig, parameters, previous, since_s)
+            shape = shape.doubted(previous.doubts)
+    except NeedleNotFound as lost:
+        return NeedleTrack(pair.captured_at_ns, Status.INVALID, (Reason(lost.reason),), timing_ms=stopwatch.elapsed_ms)
     since = previous.since_detection + 1
     return as_track(shape, pair.captured_at_ns, previous, since, Evidence(), stopwatch.elapsed_ms)
+
+
+def _looked_at_twice(
+    shape: Shape, images: Images, rig: StereoRig, parameters: TrackingParameters, previous: NeedleTrack, since_s: float
+) -> Shape:
+    """A weak shape looked at again from where the first glance put it, if that makes it less weak."""
+    first_mm = shape.curve.points_mm
+    try:
+        refined = glanced(images, rig, _models(parameters), previous=previous, since_s=since_s, first_mm=first_mm)
+        again = None if refined is None else judged(refined, rig, parameters, previous)
+    except NeedleNotFound:
+        return shape
+    return again if again is not None and len(again.reasons) < len(shape.reasons) else shape
 
 
 def search(

@@ -1,0 +1,219 @@
+"""Tracking beside which a second process looks again, without haste.
+
+The needle is followed from pair to pair in the caller's thread, which takes milliseconds. Searches of whole images take
+ten times as long: a process of its own makes them meanwhile, and what it finds is gone on from as soon as it is there.
+So no pair waits for a search but the first.
+"""
+
+import copyreg
+import ctypes
+import logging
+import multiprocessing
+import os
+import signal
+import time
+from multiprocessing.connection import Connection
+from multiprocessing.shared_memory import SharedMemory
+from types import MappingProxyType, TracebackType
+from typing import Any, Self
+
+import numpy as np
+
+from needletrack.records import Frame, NeedleTrack, StereoPair
+from needletrack.rig import Rig
+from needletrack.tracking.parameters import TrackingParameters
+from needletrack.tracking.track import adopted, audit, follow, search, track_pair
+
+_log = logging.getLogger(__name__)
+
+# An audit begins so many pairs after the one before at the soonest, or when that is done; of a weak track earlier.
+_PAIRS_PER_AUDIT, _PAIRS_PER_AUDIT_OF_WEAK = 5, 2
+# A needle that is lost is looked for where it was for so long, in case something only passed before it.
+_REMEMBERED_NS = 2_000_000_000
+_RESTART_AFTER_S, _STARTS_WITHIN_S, _ENDS_WITHIN_S = 5.0, 30.0, 1.0
+_PR_SET_PDEATHSIG, _NICE = 1, 5
+
+
+def _read_only(values: dict[str, float]) -> MappingProxyType[str, float]:
+    return MappingProxyType(values)
+
+
+# A track goes from one process to the other and back.
+copyreg.pickle(MappingProxyType, lambda proxy: (_read_only, (dict(proxy),)))
+
+
+class AuditedTracker:
+    """Our method, one pair after another, of a rig; as a context audits and searches run beside it, else in line.
+
+    The first pair, and each that has no track before it, is searched here and now.
+    """
+
+    def __init__(self, rig: Rig, parameters: TrackingParameters) -> None:
+        self._rig, self._parameters = rig, parameters
+        self._auditor: _Auditor | None = None
+        self._is_open, self._failed_at_s = False, 0.0
+        self._since_audit = 0
+        self._good: NeedleTrack | None = None
+        self.failures = 0
+
+    def __enter__(self) -> Self:
+        self._auditor, self._is_open = _Auditor(self._rig, self._parameters), True
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """End the second process; what it is at is dropped."""
+        self._is_open = False
+        self._end()
+
+    def _end(self) -> None:
+        if self._auditor is not None:
+            self._auditor.close()
+            self._auditor = None
+
+    def warm_up(self) -> None:
+        """Wait until the second process is there."""
+        if self._auditor is not None:
+            self._auditor.wait(_STARTS_WITHIN_S)
+
+    def __call__(self, pair: StereoPair, previous: NeedleTrack | None) -> NeedleTrack:
+        """The track of this pair; previous: that of the pair before, None to start without memory."""
+        if not self._is_open:
+            return track_pair(pair, self._rig, self._parameters, previous)
+        found = self._found()
+        if previous is None:
+            self._good = None
+            track = search(pair, self._rig, self._parameters)
+        else:
+            track = self._followed(pair, previous, found)
+        if track.curve is not None:
+            self._good = track
+        self._since_audit += 1
+        self._look_again(pair, track)
+        return track
+
+    def _followed(self, pair: StereoPair, previous: NeedleTrack, found: NeedleTrack | None) -> NeedleTrack:
+        if found is not None and found.curve is not None:
+            previous = found if previous.curve is None else adopted(previous, found)
+        track, good = follow(pair, self._rig, self._parameters, previous), self._good
+        if track.curve is not None or good is None or good is previous:
+            return track
+        if not 0 <= pair.captured_at_ns - good.captured_at_ns < _REMEMBERED_NS:
+            return track
+        again = follow(pair, self._rig, self._parameters, good)
+        return again if again.curve is not None else track
+
+    def _found(self) -> NeedleTrack | None:
+        """What the second process found, once."""
+        if self._auditor is None:
+            return None
+        try:
+            return self._auditor.found()
+        except (EOFError, OSError):
+            self._give_up()
+            return None
+
+    def _look_again(self, pair: StereoPair, track: NeedleTrack) -> None:
+        wanted = _PAIRS_PER_AUDIT_OF_WEAK if track.reasons else _PAIRS_PER_AUDIT
+        if track.curve is not None and self._since_audit < wanted:
+            return
+        if self._auditor is None:
+            if time.monotonic() - self._failed_at_s < _RESTART_AFTER_S:
+                return
+            self._auditor = _Auditor(self._rig, self._parameters)
+        try:
+            if self._auditor.look(pair, track):
+                self._since_audit = 0
+        except OSError:
+            self._give_up()
+
+    def _give_up(self) -> None:
+        self.failures += 1
+        self._failed_at_s = time.monotonic()
+        _log.warning("the process that audits tracks has ended; it is started again in %g s", _RESTART_AFTER_S)
+        self._end()
+
+
+class _Auditor:
+    """The second process, which looks at one pair at a time; raises OSError or EOFError where it has ended."""
+
+    def __init__(self, rig: Rig, parameters: TrackingParameters) -> None:
+        width, height = rig.left.size_px
+        self._shape = (2, height, width)
+        self._memory = SharedMemory(create=True, size=2 * width * height)
+        self._images: Any = np.ndarray(self._shape, np.uint8, self._memory.buf)
+        context = multiprocessing.get_context("spawn")
+        self._pipe, theirs = context.Pipe()
+        self._process = context.Process(
+            target=_audit_pairs,
+            args=(rig, parameters, self._memory.name, self._shape, theirs),
+            name="needletrack-audit",
+            daemon=True,
+        )
+        self._process.start()
+        theirs.close()
+        self._is_up, self._is_busy = False, False
+
+    def wait(self, seconds: float) -> None:
+        """Wait for it to be there, at most so long."""
+        if not self._is_up and self._pipe.poll(seconds):
+            self._pipe.recv()
+            self._is_up = True
+
+    def look(self, pair: StereoPair, track: NeedleTrack) -> bool:
+        """Give it a pair and the track that was followed to it; False where it is still at another one."""
+        self.wait(0.0)
+        if self._is_busy or not self._is_up:
+            return False
+        self._images[0], self._images[1] = pair.left.image, pair.right.image
+        self._pipe.send((pair.left.captured_at_ns, pair.right.captured_at_ns, pair.sequence, track))
+        self._is_busy = True
+        return True
+
+    def found(self) -> NeedleTrack | None:
+        """What it made of the pair that it was given, once it is done."""
+        if not self._is_busy or not self._pipe.poll():
+            return None
+        self._is_busy = False
+        found: NeedleTrack = self._pipe.recv()
+        return found
+
+    def close(self) -> None:
+        """End it, whatever it is at."""
+        self._process.kill()
+        self._process.join(_ENDS_WITHIN_S)
+        self._pipe.close()
+        del self._images
+        self._memory.close()
+        self._memory.unlink()
+
+
+def _audit_pairs(
+    rig: Rig, parameters: TrackingParameters, memory_name: str, shape: tuple[int, int, int], pipe: Connection
+) -> None:
+    """The second process's life: a pair in, a track out."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    # It must not outlive a parent that was killed.
+    ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
+    # Whoever starts it may be tied to a processor of its own, and must not wait for it.
+    os.sched_setaffinity(0, range(os.cpu_count() or 1))
+    os.nice(_NICE)
+    memory = SharedMemory(memory_name)
+    images: Any = np.ndarray(shape, np.uint8, memory.buf)
+    blank = Frame(np.zeros(shape[1:], np.uint8), 0)
+    search(StereoPair(blank, blank, 0), rig, parameters)
+    pipe.send(None)
+    while True:
+        try:
+            left_ns, right_ns, sequence, followed = pipe.recv()
+        except EOFError:
+            return
+        pair = StereoPair(Frame(images[0].copy(), left_ns), Frame(images[1].copy(), right_ns), sequence)
+        if followed.curve is None:
+            pipe.send(search(pair, rig, parameters))
+        else:
+            pipe.send(audit(pair, rig, parameters, followed))

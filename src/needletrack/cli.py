@@ -361,9 +361,12 @@ def watch(
         float | None,
         typer.Option(min=0, metavar="SECONDS", help="Wait so long for the daemon; else for ever."),
     ] = None,
+    max_age: Annotated[
+        float, typer.Option(min=0.001, metavar="SECONDS", help="An older track is shown as stale.")
+    ] = 0.2,
     report: Annotated[Path | None, typer.Option(help="Write the summary there, as JSON.")] = None,
 ) -> None:
-    """Show a rig's tracks as they arrive, until Ctrl-C."""
+    """Show a rig's tracks as they arrive, until Ctrl-C, with what is fresh, missing, and how far the clocks differ."""
     from needletrack.terminal import write_summary
     from needletrack.watch import watch as watch_tracks
 
@@ -374,6 +377,7 @@ def watch(
         until_gone=until_gone,
         count=count,
         wait_s=wait,
+        max_age_s=max_age,
     )
     if report is None:
         typer.echo(summary, err=True)

@@ -19,12 +19,50 @@ import zenoh
 
 from needletrack.errors import PublishError
 from needletrack.publish.clock import ClockDifference, ClockFilter, ClockMessage, Question
+from needletrack.publish.control import (
+    ControlReply,
+    ControlRequest,
+    NeedleReply,
+    NeedleRequest,
+    Outcome,
+    RedetectReply,
+    RedetectRequest,
+    SnapshotReply,
+    SnapshotRequest,
+    StartRecordingReply,
+    StartRecordingRequest,
+    StopRecordingReply,
+    StopRecordingRequest,
+)
 from needletrack.publish.keys import DEFAULT_PREFIX, RigKeys
 from needletrack.publish.message import StatusMessage, TrackMessage
 from needletrack.publish.session import DEFAULT_ENDPOINT, direct, open_session
 from needletrack.records import DropReason
 
-__all__ = ["ClockDifference", "Freshness", "Health", "Missed", "Received", "StatusMessage", "Subscriber", "TrackMessage"]
+__all__ = [
+    "ClockDifference",
+    "ControlReply",
+    "ControlRequest",
+    "Freshness",
+    "Health",
+    "Missed",
+    "NeedleReply",
+    "NeedleRequest",
+    "Outcome",
+    "Received",
+    "RedetectReply",
+    "RedetectRequest",
+    "SnapshotReply",
+    "SnapshotRequest",
+    "StartRecordingReply",
+    "StartRecordingRequest",
+    "StatusMessage",
+    "StopRecordingReply",
+    "StopRecordingRequest",
+    "Subscriber",
+    "TrackMessage",
+    "control",
+]
 
 # A track comes for every pair, also an invalid one: this many periods without any are silence.
 SILENT_PERIODS = 5
@@ -35,6 +73,8 @@ HEARTBEATS_MISSED = 3
 # Enough for one of them to have met a short queue; later ones go with the heartbeats.
 CLOCK_QUESTIONS_AT_FIRST = 4
 QUESTION_TIMEOUT_S = 1.0
+# A session needs a moment to meet the daemon, and to learn what it answers.
+ASK_AGAIN_S = 0.05
 
 # Single frames: they never became a pair, and so never had a number that could be missing.
 FRAME_DROPS = frozenset(
@@ -135,9 +175,9 @@ class Subscriber:
     """Receives one rig's tracks; every method may be called from any thread.
 
     max_age_s: an older track is stale. silent_after_s: silence is noticed after it (None: five periods
-    of the rate seen, 0.05 s at least, so within 0.1 s at 60 Hz; three heartbeats that are due). capacity: tracks kept for `next` and iteration; the oldest is
-    dropped and counted. It is no error if the daemon is not there yet: `health` says never_seen, and
-    it is found when it comes. Raises PublishError for a malformed endpoint or rig name.
+    of the rate seen, 0.05 s at least, so within 0.1 s at 60 Hz; three heartbeats that are due). capacity:
+    tracks kept for `next` and iteration; the oldest is dropped and counted. It is no error if the daemon is
+    not there yet: `health` says never_seen, and it is found when it comes. Raises PublishError for a malformed endpoint or rig name.
     """
 
     def __init__(
@@ -246,7 +286,7 @@ class Subscriber:
 
     @property
     def clock(self) -> ClockDifference | None:
-        """How far this host's clock and the daemon's differ, asked anew with each heartbeat; None before the first answer.
+        """How far this host's clock and the daemon's differ, asked with each heartbeat; None before the first answer.
 
         Ages are corrected for it, so that clocks which differ make no track older or younger.
         """
@@ -466,6 +506,39 @@ class Subscriber:
     def _rigs_alive(self) -> list[str]:
         replies = self._liveliness.get(f"{self.keys.prefix}/*/alive", timeout=1.0)
         return sorted({str(reply.ok.key_expr).split("/")[-2] for reply in replies if reply.ok is not None})
+
+
+def control(
+    rig: str,
+    request: ControlRequest,
+    connect: Sequence[str] = (DEFAULT_ENDPOINT,),
+    *,
+    key_prefix: str = DEFAULT_PREFIX,
+    timeout_s: float = 10.0,
+) -> ControlReply:
+    """Ask a rig's daemon for something, and return its answer, whose class belongs to the request's.
+
+    Asked again until an answer comes: the request's id sees to it that nothing is done twice. A refusal is an answer
+    (`outcome`). Raises PublishError where none comes in time, or it cannot be read.
+    """
+    keys = RigKeys(rig, key_prefix)
+    key, until_s = keys.control(request.command), time.monotonic() + timeout_s
+    reached = False
+    with open_session(connect=connect) as session:
+        while (left_s := until_s - time.monotonic()) > 0:
+            for reply in session.get(key, payload=request.to_json(), timeout=left_s):
+                if reply.ok is not None:
+                    return request.reply_from_json(reply.ok.payload.to_bytes())
+            reached = reached or bool(session.info.transports())
+            time.sleep(min(ASK_AGAIN_S, left_s))
+    where = " or ".join(connect)
+    if not reached:
+        raise PublishError(f"nobody answers at {where} within {timeout_s:g} s: is the daemon running, and there?")
+    raise PublishError(
+        f"{where} answers, but nobody on {key} within {timeout_s:g} s: check the rig's name and the key prefix; do the "
+        "access rules let this certificate ask? A replay takes no requests. What was asked may have been done all the "
+        "same: the same request, repeated, is answered with its outcome"
+    )
 
 
 def _pairs_dropped(message: TrackMessage) -> int:

@@ -37,7 +37,9 @@ class ClockMessage(WirePart):
         try:
             return cls.model_validate_json(data, strict=True)
         except ValidationError as error:
-            raise PublishError(f"not a needletrack.clock.v{WIRE_VERSION} message: {error.error_count()} faults") from error
+            raise PublishError(
+                f"not a needletrack.clock.v{WIRE_VERSION} message: {error.error_count()} faults"
+            ) from error
 
     def to_json(self) -> bytes:
         """UTF-8 JSON on one line."""

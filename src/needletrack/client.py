@@ -177,7 +177,8 @@ class Subscriber:
     max_age_s: an older track is stale. silent_after_s: silence is noticed after it (None: five periods
     of the rate seen, 0.05 s at least, so within 0.1 s at 60 Hz; three heartbeats that are due). capacity:
     tracks kept for `next` and iteration; the oldest is dropped and counted. It is no error if the daemon is
-    not there yet: `health` says never_seen, and it is found when it comes. Raises PublishError for a malformed endpoint or rig name.
+    not there yet: `health` says never_seen, and it is found when it comes. Raises PublishError for a malformed
+    endpoint or rig name.
     """
 
     def __init__(

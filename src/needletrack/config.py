@@ -240,13 +240,17 @@ class Config(BaseModel):
         """The configuration with the needle type of this name in use; raises ConfigError for an unknown name."""
         if name == DEFAULT_NEEDLE:
             return self
-        for needle in self.control.needles:
-            if needle.name == name:
-                tracking = self.tracking.model_copy(update={"needle": needle.over(self.tracking.needle)})
-                # Not by model_copy, which would keep the digest.
-                return Config.model_validate({**dict(self), "tracking": tracking})
-        known = ", ".join([DEFAULT_NEEDLE, *(needle.name for needle in self.control.needles)])
-        raise ConfigError(f"no needle {name!r} in control.needles of the configuration: there are {known}")
+        whole = {needle.name: needle.over(self.tracking.needle) for needle in self.control.needles}
+        if name not in whole:
+            known = ", ".join([DEFAULT_NEEDLE, *whole])
+            raise ConfigError(f"no needle {name!r} in control.needles of the configuration: there are {known}")
+        # The types stay what they are: what they left out was said by the needle that is replaced.
+        types = tuple(NeedleType(name=other, **needle.model_dump()) for other, needle in whole.items())
+        values = {field: getattr(self, field) for field in Config.model_fields}
+        values["tracking"] = self.tracking.model_copy(update={"needle": whole[name]})
+        values["control"] = self.control.model_copy(update={"needles": types})
+        # Not by model_copy, which would keep the digest.
+        return Config.model_validate(values)
 
 
 def load_config(path: Path | str | None = None) -> Config:

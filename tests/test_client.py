@@ -309,7 +309,8 @@ def test_at_60_hz_silence_is_noticed_within_100_ms(endpoint: str) -> None:
         Subscriber("lab", [endpoint], max_age_s=60.0) as subscriber,
     ):
         assert publisher.wait_for_subscriber(WAIT_S)
-        stop, sent = threading.Event(), []
+        stop = threading.Event()
+        sent: list[Received] = []
         due_s = time.monotonic()
         while len(sent) < 40:
             due_s += 1 / 60

@@ -14,7 +14,7 @@ from needletrack.publish.message import RunContext, ServiceState, Source, TrackM
 from needletrack.recording.asl import AslRecording
 from needletrack.recording.replay import ReplaySource
 from needletrack.records import DropReason, NeedleTrack, Reason, Status, StereoPair
-from needletrack.service import Arrival, LatestSlot, Service
+from needletrack.service import Arrival, LatestSlot, Service, Tracker
 from needletrack.tracking.track import track_pair
 
 RECORDINGS = Path(__file__).parent / "data" / "recordings"
@@ -346,7 +346,7 @@ def test_a_pitched_camera_is_noticed_and_said_and_tracking_goes_on_from_its_own_
 def test_what_is_ordered_holds_from_the_next_pair_on(recording: AslRecording, pair: StereoPair) -> None:
     given: list[tuple[str, NeedleTrack | None]] = []
 
-    def tracker(name: str) -> Callable[[StereoPair, NeedleTrack | None], NeedleTrack]:
+    def tracker(name: str) -> Tracker:
         def tracked(pair: StereoPair, previous: NeedleTrack | None) -> NeedleTrack:
             given.append((name, previous))
             if name == "orders while it tracks":

@@ -37,7 +37,7 @@ def test_the_truth_is_within_the_stated_uncertainty(ahead_ns: int, ways: list[tu
 
 def test_the_shortest_way_counts_and_ages() -> None:
     clock = ClockFilter()
-    at_ns = DAY_NS
+    at_ns, answered_ns = DAY_NS, 0
     for way_ms in (40, 2, 90):
         answered_ns = asked(clock, at_ns, way_ms * MS, 0, 0, 7 * MS)
         at_ns += 1_000 * MS

@@ -5,7 +5,7 @@ import logging
 import socket
 import threading
 from collections.abc import Callable, Iterator, Mapping
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -287,7 +287,7 @@ def test_too_many_at_once_are_refused_at_once(endpoint: str) -> None:
         asked = [
             pool.submit(answer, session, "re-detect", redetect(request_id=f"r{n}")) for n in range(MAX_WAITING + 3)
         ]
-        busy = []
+        busy: list[Future[dict[str, Any]]] = []
         while len(busy) < 3:
             busy = [each for each in asked if each.done()]
         assert {each.result()["code"] for each in busy} == {"busy"}

@@ -141,7 +141,10 @@ class Received:
         if published is None:
             return None
         by_clocks_ms = (self.received_at_ns - published) / 1e6
-        return by_clocks_ms if self.clock is None else by_clocks_ms - self.clock.ours_minus_daemons_ms
+        # Clocks that may be alike, as on one host, are taken as they are: a correction would only add its error.
+        if self.clock is None or abs(self.clock.ours_minus_daemons_ms) <= self.clock.uncertainty_ms:
+            return by_clocks_ms
+        return by_clocks_ms - self.clock.ours_minus_daemons_ms
 
     @property
     def latency_ms(self) -> float | None:

@@ -17,6 +17,7 @@ from hypothesis import strategies as st
 
 from needletrack.client import Outcome, StatusMessage, control
 from needletrack.errors import PublishError
+from needletrack.publish import control as control_module
 from needletrack.publish.control import (
     ANSWERS_KEPT,
     CONTROL_CODE_MEANING,
@@ -266,6 +267,21 @@ def test_a_look_at_all_keys_asks_for_nothing(endpoint: str) -> None:
             assert [reply for reply in found if "outcome" in reply] == []
         assert work.done == []
         assert taken.counts == {"done": 0, "refused": 0, "failed": 0}
+
+
+def test_a_flood_of_nonsense_is_counted_whole_and_logged_in_part(
+    endpoint: str, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(control_module, "_REFUSALS_TOLD_EVERY_S", 3600.0)
+    work = Work()
+    with desk(endpoint, work) as (taken, session):
+        for _ in range(40):
+            answer(session, "re-detect", b"x")
+        assert taken.counts["refused"] == 40
+        assert len([record for record in caplog.records if "re-detect refused" in record.getMessage()]) == 1
+        caplog.set_level(logging.INFO)
+        answer(session, "re-detect", redetect())
+        assert "re-detect done; 39 refusals before were not logged" in caplog.text
 
 
 def test_a_defect_is_answered_and_the_desk_goes_on(endpoint: str, caplog: pytest.LogCaptureFixture) -> None:

@@ -8,6 +8,7 @@ import hashlib
 import logging
 import queue
 import threading
+import time
 import uuid
 from collections import Counter, OrderedDict
 from collections.abc import Callable, Mapping
@@ -33,6 +34,7 @@ MAX_REQUEST_BYTES = 4096
 MAX_WAITING = 16
 ANSWERS_KEPT = 256
 _LONGEST_NAME = 64
+_REFUSALS_TOLD_EVERY_S = 1.0
 # A stop of the daemon does not wait for the disk.
 _ENDS_WITHIN_S = 0.3
 
@@ -282,7 +284,10 @@ class ControlDesk:
         self._prefix = keys.control("")
         self._waiting: queue.SimpleQueue[_Waiting | None] = queue.SimpleQueue()
         self._answers: OrderedDict[str, tuple[bytes, bytes]] = OrderedDict()
+        # Requests are refused in Zenoh's threads, too.
+        self._telling = threading.Lock()
         self._counts: Counter[Outcome] = Counter()
+        self._quiet_until_s, self._untold = 0.0, 0
         self._stopping = False
         self._thread = threading.Thread(target=self._work, name="needletrack-control", daemon=True)
 
@@ -405,10 +410,20 @@ class ControlDesk:
         )
 
     def _told(self, reply: ControlReply) -> None:
-        self._counts[reply.outcome] += 1
+        with self._telling:
+            self._counts[reply.outcome] += 1
+            if reply.outcome is Outcome.REFUSED:
+                # Whoever floods us with nonsense shall not fill the disk with it.
+                now_s = time.monotonic()
+                if now_s < self._quiet_until_s:
+                    self._untold += 1
+                    return
+                self._quiet_until_s = now_s + _REFUSALS_TOLD_EVERY_S
+            untold, self._untold = self._untold, 0
         told = f" ({reply.code}: {reply.detail})" if reply.code else ""
+        more = f"; {untold} refusals before were not logged" if untold else ""
         level = logging.INFO if reply.outcome is Outcome.DONE else logging.WARNING
-        _log.log(level, "control: %s %s%s", reply.command, reply.outcome.value, told)
+        _log.log(level, "control: %s %s%s%s", reply.command, reply.outcome.value, told, more)
 
 
 def _read(model: type[ControlRequest], payload: bytes) -> ControlRequest:

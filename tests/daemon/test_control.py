@@ -113,6 +113,10 @@ def test_a_disk_that_takes_nothing_is_the_answer(tmp_path: Path) -> None:
             tmp_path.unlink()
             tmp_path.with_name("gone").rename(tmp_path)
         daemon.next()
+        # Mended: the next recording tries at once.
+        done(daemon, StopRecordingRequest(), StopRecordingReply)
+        again = done(daemon, StartRecordingRequest(), StartRecordingReply)
+        assert (again.changed, again.file is not None) == (True, True)
 
 
 def test_a_snapshot_is_a_recording_of_the_next_pair_with_its_track(tmp_path: Path) -> None:

@@ -182,7 +182,7 @@ class Recorder:
     def end(self, timeout_s: float) -> bool:
         """Record no more, and wait at most so long until the file is finished; False where nothing was being recorded.
 
-        Raises RecordingError where it is not finished in time; it will be as soon as the disk allows.
+        Raises RecordingError where the disk does not let it be finished, or not in time: then it will be later.
         """
         until_s = time.monotonic() + timeout_s
         with self._turn:
@@ -207,6 +207,8 @@ class Recorder:
                     return True
                 self._collect()
                 if self._finished >= wanted:
+                    if self._state.error is not None:
+                        raise RecordingError(self._state.error)
                     return True
                 if not self._process.is_alive():
                     raise RecordingError("the recorder has ended: `needletrack recover` saves the file")
@@ -403,7 +405,7 @@ def _record(
             elif isinstance(command, _Track):
                 files.add_track(command)
             elif isinstance(command, _Finish):
-                files.finish()
+                files.end()
                 with suppress(BrokenPipeError):
                     returns.send(_Freed(-1, recorded=False, state=files.state, finished=command.number))
             else:
@@ -481,6 +483,12 @@ class _Files:
             self._writer.abandon()
             self._pause(_unwritable(self._writer.path, error))
         self._writer = None
+
+    def end(self) -> None:
+        """Finish, and forget what kept the disk from taking it: the next recording tries anew, and at once."""
+        self._retry_at_s = self._looked_at_s = 0.0
+        self.state = replace(self.state, error=None)
+        self.finish()
 
     def _attempt(self, write: Callable[[PairWriter], None]) -> bool:
         now_s = time.monotonic()

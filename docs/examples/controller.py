@@ -43,8 +43,9 @@ def main() -> int:
                 said = doing
             if options.until_gone and health.state is Freshness.GONE:
                 return 0
+            # What came too late is left out, and not caught up with.
             due_s = max(due_s + 1 / options.rate_hz, time.monotonic())
-            time.sleep(due_s - time.monotonic())
+            time.sleep(max(0.0, due_s - time.monotonic()))
 
 
 if __name__ == "__main__":

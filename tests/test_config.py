@@ -239,3 +239,61 @@ def test_the_digest_follows_the_values_and_not_their_place(tmp_path: Path) -> No
 def test_the_configuration_cannot_be_changed_behind_its_digest() -> None:
     with pytest.raises(ValueError, match="frozen"):
         setattr(Config().pairing, "tolerance_us", 5.0)  # noqa: B010
+
+
+NEEDLES = """
+[tracking.needle]
+max_diameter_mm = 2.0
+[[control.needles]]
+name = "16g"
+min_diameter_mm = 1.6
+[[control.needles]]
+name = "22g"
+max_diameter_mm = 0.8
+max_length_mm = 60.0
+tip_tapers_mm = [0.0]
+"""
+
+
+def test_a_needle_type_is_the_configured_needle_but_for_what_it_says(tmp_path: Path) -> None:
+    config = load_config(written(tmp_path, NEEDLES))
+    thick, thin = config.with_needle("16g"), config.with_needle("22g")
+    assert (thick.tracking.needle.min_diameter_mm, thick.tracking.needle.max_diameter_mm) == (1.6, 2.0)
+    assert thin.tracking.needle.model_dump() == {
+        **config.tracking.needle.model_dump(), "max_diameter_mm": 0.8, "max_length_mm": 60.0, "tip_tapers_mm": (0.0,),
+    }  # fmt: skip
+    assert config.with_needle("default") == config
+    # What a track was made with is what its digest says, whatever else could have been chosen.
+    assert len({config.digest, thick.digest, thin.digest}) == 3
+    alone = load_config(written(tmp_path, "[tracking.needle]\nmin_diameter_mm = 1.6\nmax_diameter_mm = 2.0"))
+    assert thick.digest == alone.digest
+    # From any of them the others can be chosen, and a recording's copy can be read.
+    again = Config.model_validate_json(thick.model_dump_json())
+    assert again.with_needle("22g").digest == thin.digest
+    with pytest.raises(
+        ConfigError, match=r"no needle '18g' in control\.needles of the configuration: there are default"
+    ):
+        config.with_needle("18g")
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        ('name = "default"', "is the needle of [tracking.needle]: choose another name"),
+        ('name = "a b"', "control.needles[0].name = 'a b'"),
+        ("min_diameter_mm = 1.0", "control.needles[0].name is missing"),
+        ('name = "x"\nmin_diameter_mm = 3.0', "x, with what it leaves to tracking.needle: min_diameter_mm is above"),
+        ('name = "x"\ndiameter_mm = 3.0', "unknown key control.needles[0].diameter_mm: did you mean"),
+        ('name = "x"\n[[control.needles]]\nname = "x"', "needles: x twice"),
+    ],
+)
+def test_a_needle_type_that_cannot_be_is_refused(tmp_path: Path, text: str, told: str) -> None:
+    with pytest.raises(ConfigError) as refused:
+        load_config(written(tmp_path, f"[[control.needles]]\n{text}"))
+    assert told in str(refused.value)
+
+
+def test_what_could_be_asked_of_the_daemon_is_not_in_the_digest(tmp_path: Path) -> None:
+    config = load_config(written(tmp_path, '[control]\nenabled = true\ntoken_file = "secret"\nsnapshot_folder = "s"'))
+    assert config.digest == Config().digest
+    assert (config.control.token_file, config.control.snapshot_folder) == (tmp_path / "secret", tmp_path / "s")

@@ -14,7 +14,7 @@ from needletrack.publish.message import RunContext, ServiceState, Source, TrackM
 from needletrack.recording.asl import AslRecording
 from needletrack.recording.replay import ReplaySource
 from needletrack.records import DropReason, NeedleTrack, Reason, Status, StereoPair
-from needletrack.service import Arrival, LatestSlot, Service
+from needletrack.service import Arrival, LatestSlot, Service, Tracker
 from needletrack.tracking.track import track_pair
 
 RECORDINGS = Path(__file__).parent / "data" / "recordings"
@@ -341,3 +341,43 @@ def test_a_pitched_camera_is_noticed_and_said_and_tracking_goes_on_from_its_own_
         drift=drift,
     ).run([kept], threading.Event())
     assert not any(Reason.CALIBRATION_DRIFT in track.reasons for track in kept.tracks)
+
+
+def test_what_is_ordered_holds_from_the_next_pair_on(recording: AslRecording, pair: StereoPair) -> None:
+    given: list[tuple[str, NeedleTrack | None]] = []
+
+    def tracker(name: str) -> Tracker:
+        def tracked(pair: StereoPair, previous: NeedleTrack | None) -> NeedleTrack:
+            given.append((name, previous))
+            if name == "orders while it tracks":
+                ordered.append(service.use(tracker("second"), "d" * 12))
+            return nothing(pair, previous)
+
+        return tracked
+
+    ordered: list[int | None] = []
+    script: list[int | Callable[[], object]] = [
+        lambda: ordered.append(service.forget()),
+        3,
+        4,
+        lambda: ordered.append(service.forget()),
+        5,
+        6,
+        lambda: service.use(tracker("orders while it tracks"), "e" * 12),
+        7,
+        8,
+        9,
+    ]
+    kept = Kept()
+    service = Service(Scripted(pair, script), tracker("first"), recording.rig, context(recording), every_frame=True)
+    service.run([kept], threading.Event())
+    assert ordered == [None, 4, 7]
+    assert [name for name, _ in given] == ["first"] * 4 + ["orders while it tracks"] + ["second"] * 2
+    tracks = kept.tracks
+    remembered = [None, tracks[0], None, tracks[2], None, None, tracks[5]]
+    assert [previous for _, previous in given] == remembered
+    # A pair that was taken up before an order is published as what it was tracked as.
+    digests = [message.config_digest[0] for message in kept.messages]
+    assert digests == ["c", "c", "c", "c", "e", "d", "d"]
+    assert service.status().config_digest == "d" * 12
+    assert len({message.run_id for message in kept.messages}) == 1

@@ -109,7 +109,7 @@ def test_in_a_pipe_there_are_plain_lines(endpoint: str) -> None:
     assert "\x1b" not in shown(console)
     x, y, z = message(0).tip.position_mm  # type: ignore[union-attr]
     assert f"ok  tip x {x:.2f} ± 0.02  y {y:.2f} ± 0.02  z {z:.2f} ± 0.05 mm  length 50.00 mm" in lines[-1]
-    assert "dropped 0  lost 0" in lines[-1]
+    assert "dropped 0  lost 0  clock " in lines[-1]
 
 
 def test_reasons_are_shown(endpoint: str) -> None:
@@ -133,6 +133,8 @@ def test_on_a_terminal_there_is_a_panel(endpoint: str) -> None:
             assert publisher.wait_for_subscriber(WAIT_S)
             for number in (0, 2):
                 publisher.publish(message(number, dropped=number // 2))
+            # The clocks are compared as soon as the daemon is seen, and drawn ten times a second.
+            threading.Event().wait(0.4)
         assert summary.result(WAIT_S).messages == 2
     last = re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", shown(console)).rsplit("needletrack · lab", maxsplit=1)[-1]
     for words in (
@@ -141,6 +143,7 @@ def test_on_a_terminal_there_is_a_panel(endpoint: str) -> None:
         "2 tracks   2 ok",
         "1 dropped (daemon's count: overwritten 1)   0 lost on the way",
         "gone",
+        "clock  ours is ",
         "live running   60.0 pairs/s   calibrated 28 days ago: too long",
         endpoint,
     ):

@@ -361,9 +361,12 @@ def watch(
         float | None,
         typer.Option(min=0, metavar="SECONDS", help="Wait so long for the daemon; else for ever."),
     ] = None,
+    max_age: Annotated[
+        float, typer.Option(min=0.001, metavar="SECONDS", help="An older track is shown as stale.")
+    ] = 0.2,
     report: Annotated[Path | None, typer.Option(help="Write the summary there, as JSON.")] = None,
 ) -> None:
-    """Show a rig's tracks as they arrive, until Ctrl-C."""
+    """Show a rig's tracks as they arrive, until Ctrl-C, with what is fresh, missing, and how far the clocks differ."""
     from needletrack.terminal import write_summary
     from needletrack.watch import watch as watch_tracks
 
@@ -374,11 +377,55 @@ def watch(
         until_gone=until_gone,
         count=count,
         wait_s=wait,
+        max_age_s=max_age,
     )
     if report is None:
         typer.echo(summary, err=True)
     else:
         write_summary(summary, report)
+
+
+@app.command()
+@plain_errors
+def control(
+    rig: Annotated[str, typer.Argument(metavar="RIG", help="The rig's name, which is part of the key.")],
+    command: Annotated[
+        Literal["start-recording", "stop-recording", "snapshot", "re-detect", "needle"],
+        typer.Argument(metavar="COMMAND", help="start-recording, stop-recording, snapshot, re-detect, or needle."),
+    ],
+    name: Annotated[
+        str | None, typer.Argument(metavar="NAME", help="Of needle: the type to change to, or default.")
+    ] = None,
+    connect: Annotated[
+        list[str] | None,
+        typer.Option(metavar="ENDPOINT", help=f"Where the daemon is; default {DEFAULT_ENDPOINT}."),
+    ] = None,
+    key_prefix: Annotated[str, typer.Option(help="As in the daemon's configuration.")] = DEFAULT_PREFIX,
+    token_file: Annotated[
+        Path | None, typer.Option(help="File with the daemon's control token, where it asks for one.")
+    ] = None,
+    request_id: Annotated[
+        str | None, typer.Option(help="Repeat a request: it is answered as before, and not done twice.")
+    ] = None,
+    timeout: Annotated[float, typer.Option(min=0.1, metavar="SECONDS", help="Wait so long for the answer.")] = 10.0,
+) -> None:
+    """Ask a running daemon to record, to take a snapshot, to detect anew, or to change the needle.
+
+    The answer goes to stdout, as JSON. Exit code 0 where it was done; 1 where it failed; 2 where it was refused, or
+    nobody answered.
+    """
+    from needletrack.client import Outcome
+    from needletrack.client import control as ask
+    from needletrack.daemon.control import read_token
+    from needletrack.publish.control import request_of
+
+    token = None if token_file is None else read_token(token_file)
+    request = request_of(command, needle=name, token=token, request_id=request_id)
+    reply = ask(rig, request, connect or [DEFAULT_ENDPOINT], key_prefix=key_prefix, timeout_s=timeout)
+    typer.echo(reply.to_json().decode())
+    if reply.outcome is not Outcome.DONE:
+        typer.echo(f"needletrack: {command} {reply.outcome.value} ({reply.code}): {reply.detail}", err=True)
+        raise typer.Exit(1 if reply.outcome is Outcome.FAILED else 2)
 
 
 @rig_app.command("show")

@@ -18,12 +18,51 @@ from typing import Self
 import zenoh
 
 from needletrack.errors import PublishError
+from needletrack.publish.clock import ClockDifference, ClockFilter, ClockMessage, Question
+from needletrack.publish.control import (
+    ControlReply,
+    ControlRequest,
+    NeedleReply,
+    NeedleRequest,
+    Outcome,
+    RedetectReply,
+    RedetectRequest,
+    SnapshotReply,
+    SnapshotRequest,
+    StartRecordingReply,
+    StartRecordingRequest,
+    StopRecordingReply,
+    StopRecordingRequest,
+)
 from needletrack.publish.keys import DEFAULT_PREFIX, RigKeys
 from needletrack.publish.message import StatusMessage, TrackMessage
 from needletrack.publish.session import DEFAULT_ENDPOINT, direct, open_session
 from needletrack.records import DropReason
 
-__all__ = ["Freshness", "Health", "Missed", "Received", "StatusMessage", "Subscriber", "TrackMessage"]
+__all__ = [
+    "ClockDifference",
+    "ControlReply",
+    "ControlRequest",
+    "Freshness",
+    "Health",
+    "Missed",
+    "NeedleReply",
+    "NeedleRequest",
+    "Outcome",
+    "Received",
+    "RedetectReply",
+    "RedetectRequest",
+    "SnapshotReply",
+    "SnapshotRequest",
+    "StartRecordingReply",
+    "StartRecordingRequest",
+    "StatusMessage",
+    "StopRecordingReply",
+    "StopRecordingRequest",
+    "Subscriber",
+    "TrackMessage",
+    "control",
+]
 
 # A track comes for every pair, also an invalid one: this many periods without any are silence.
 SILENT_PERIODS = 5
@@ -31,6 +70,11 @@ SILENT_AFTER_S = (0.05, 3.0)
 SILENT_BEFORE_RATE_IS_KNOWN_S = 1.0
 PERIODS_REMEMBERED = 16
 HEARTBEATS_MISSED = 3
+# Enough for one of them to have met a short queue; later ones go with the heartbeats.
+CLOCK_QUESTIONS_AT_FIRST = 4
+QUESTION_TIMEOUT_S = 1.0
+# A session needs a moment to meet the daemon, and to learn what it answers.
+ASK_AGAIN_S = 0.05
 
 # Single frames: they never became a pair, and so never had a number that could be missing.
 FRAME_DROPS = frozenset(
@@ -79,18 +123,28 @@ class Missed:
 
 @dataclass(frozen=True, slots=True)
 class Received:
-    """One track as it arrived; received_at_ns is Unix time, received_monotonic_ns CLOCK_MONOTONIC."""
+    """One track as it arrived; received_at_ns is Unix time, received_monotonic_ns CLOCK_MONOTONIC.
+
+    clock: what was known then of both hosts' clocks; None: not yet measured.
+    """
 
     message: TrackMessage
     received_at_ns: int
     received_monotonic_ns: int
     missed: Missed
+    clock: ClockDifference | None = None
 
     @property
     def transit_ms(self) -> float | None:
-        """From publishing to receiving, by the clocks of both hosts; None in a deterministic replay."""
+        """From publishing to receiving, corrected for what is known of the clocks; None in a deterministic replay."""
         published = self.message.published_at_ns
-        return None if published is None else (self.received_at_ns - published) / 1e6
+        if published is None:
+            return None
+        by_clocks_ms = (self.received_at_ns - published) / 1e6
+        # Clocks that may be alike, as on one host, are taken as they are: a correction would only add its error.
+        if self.clock is None or abs(self.clock.ours_minus_daemons_ms) <= self.clock.uncertainty_ms:
+            return by_clocks_ms
+        return by_clocks_ms - self.clock.ours_minus_daemons_ms
 
     @property
     def latency_ms(self) -> float | None:
@@ -102,8 +156,9 @@ class Received:
     def age_ms(self) -> float:
         """How old the track is now: since the exposure (live) or the pair's release (replay).
 
-        A replay's recorded stamps do not count. At least what this host alone can vouch for, so that a
-        daemon's clock that runs ahead cannot make an old track look young.
+        A replay's recorded stamps do not count. Nor does a difference of the clocks, once it is measured. At least
+        what this host alone can vouch for, so that a daemon's clock that runs ahead cannot make an old track look
+        young.
         """
         here = (time.monotonic_ns() - self.received_monotonic_ns) / 1e6
         return here + max(self.message.latency_ms or 0.0, self.latency_ms or 0.0)
@@ -123,9 +178,10 @@ class Subscriber:
     """Receives one rig's tracks; every method may be called from any thread.
 
     max_age_s: an older track is stale. silent_after_s: silence is noticed after it (None: five periods
-    of the rate seen, 0.05 s at least). capacity: tracks kept for `next` and iteration; the oldest is
-    dropped and counted. It is no error if the daemon is not there yet: `health` says never_seen, and
-    it is found when it comes. Raises PublishError for a malformed endpoint or rig name.
+    of the rate seen, 0.05 s at least, so within 0.1 s at 60 Hz; three heartbeats that are due). capacity:
+    tracks kept for `next` and iteration; the oldest is dropped and counted. It is no error if the daemon is
+    not there yet: `health` says never_seen, and it is found when it comes. Raises PublishError for a malformed
+    endpoint or rig name.
     """
 
     def __init__(
@@ -135,7 +191,7 @@ class Subscriber:
         *,
         listen: Sequence[str] = (),
         key_prefix: str = DEFAULT_PREFIX,
-        max_age_s: float = 0.2,
+        max_age_s: float = 0.1,
         silent_after_s: float | None = None,
         capacity: int = 64,
     ) -> None:
@@ -154,7 +210,7 @@ class Subscriber:
         self._overflowed_before_next = 0
         self._last_track_ns: int | None = None
         self._periods_s: deque[float] = deque(maxlen=PERIODS_REMEMBERED)
-        self._transits_ms: deque[float] = deque(maxlen=PERIODS_REMEMBERED)
+        self._clock = ClockFilter()
         self._overflowed = 0
         self._undecodable = 0
         self._unreadable_reason = ""
@@ -167,7 +223,14 @@ class Subscriber:
             # while another thread calls a method of it.
             self._info = session.info
             self._liveliness = session.liveliness()
-            self._status_query = session.declare_querier(self.keys.status)
+            self._status_query = session.declare_querier(self.keys.status, timeout=QUESTION_TIMEOUT_S)
+            self._clock_query = session.declare_querier(
+                self.keys.clock,
+                timeout=QUESTION_TIMEOUT_S,
+                congestion_control=zenoh.CongestionControl.DROP,
+                priority=zenoh.Priority.INTERACTIVE_HIGH,
+                express=True,
+            )
             session.declare_subscriber(self.keys.track, direct(self._on_track))
             session.declare_subscriber(self.keys.status, direct(self._on_status))
             self._liveliness.declare_subscriber(self.keys.alive, direct(self._on_liveliness), history=True)
@@ -226,15 +289,13 @@ class Subscriber:
             return self._undecodable
 
     @property
-    def clock_difference_ms(self) -> float | None:
-        """The shortest of the last transits by both clocks: our clock minus the daemon's, plus the way.
+    def clock(self) -> ClockDifference | None:
+        """How far this host's clock and the daemon's differ, asked with each heartbeat; None before the first answer.
 
-        Negative: the daemon's clock is ahead. Large: it is behind, or every track was late. None before
-        the first track, and for a deterministic replay.
+        Ages are corrected for it, so that clocks which differ make no track older or younger.
         """
         with self._changed:
-            self._decode()
-            return min(self._transits_ms, default=None)
+            return self._clock.at(time.monotonic_ns())
 
     @property
     def health(self) -> Health:
@@ -268,6 +329,30 @@ class Subscriber:
 
     def _on_status(self, sample: zenoh.Sample) -> None:
         self._take_status(sample.payload.to_bytes())
+        self._ask_the_time()
+
+    def _ask_the_time(self) -> None:
+        """Send one question; its answer is taken in Zenoh's thread."""
+        with self._changed:
+            if self._closed:
+                return
+        asked = Question(time.time_ns(), time.monotonic_ns())
+
+        def take(reply: zenoh.Reply) -> None:
+            answered_ns = time.monotonic_ns()
+            if reply.ok is None:
+                return
+            try:
+                answer = ClockMessage.from_json(reply.ok.payload.to_bytes())
+            except PublishError as error:
+                with self._changed:
+                    self._unreadable(str(error))
+                return
+            with self._changed:
+                self._clock.add(asked, answer, answered_ns)
+
+        with suppress(zenoh.ZError):  # closed between the check and this line
+            self._clock_query.get(direct(take))
 
     def _on_status_reply(self, reply: zenoh.Reply) -> None:
         if reply.ok is not None:
@@ -282,6 +367,9 @@ class Subscriber:
                 self._unreadable(str(error))
             return
         with self._changed:
+            if status.rig != self.keys.rig:
+                self._unreadable(f"a status of rig {status.rig!r} on {self.keys.status}")
+                return
             self._status, self._status_monotonic_ns = status, monotonic_ns
             self._changed.notify_all()
 
@@ -291,12 +379,18 @@ class Subscriber:
             self._alive = alive
             self._periods_s.clear()
             self._last_track_ns = None
+            if alive:
+                # What is known of the daemon that went says nothing of the next one.
+                self._status_monotonic_ns = 0
+                self._clock.forget()
             self._changed.notify_all()
             closed = self._closed
         if alive and not closed:
             # A late joiner has the status at once, not at the next heartbeat.
             with suppress(zenoh.ZError):  # closed between the check and this line
                 self._status_query.get(direct(self._on_status_reply))
+            for _ in range(CLOCK_QUESTIONS_AT_FIRST):
+                self._ask_the_time()
 
     def _decode(self) -> bool:
         """Turn what arrived into tracks, in order; whether there were any."""
@@ -319,13 +413,12 @@ class Subscriber:
                 sample.received_at_ns,
                 sample.received_monotonic_ns,
                 self._missed(message, self._overflowed_before_next),
+                self._clock.at(sample.received_monotonic_ns),
             )
             self._overflowed_before_next = 0
             if self._last_track_ns is not None:
                 self._periods_s.append((sample.received_monotonic_ns - self._last_track_ns) / 1e9)
             self._last_track_ns = sample.received_monotonic_ns
-            if received.transit_ms is not None:
-                self._transits_ms.append(received.transit_ms)
             if len(self._queue) == self._queue.maxlen:
                 self._overflowed += 1
             self._queue.append(received)
@@ -361,10 +454,16 @@ class Subscriber:
         if silence_s > (limit_s := self._silence_limit_s()):
             reason = f"no track for {silence_s:.2f} s (limit {limit_s:.2f} s); {self._daemon_says()}"
             return Health(Freshness.SILENT, reason, age_ms)
+        if (quiet_s := self._heartbeat_overdue_s()) is not None:
+            reason = f"tracks come, but no heartbeat for {quiet_s:.1f} s: part of the daemon hangs, or the link is full"
+            return Health(Freshness.SILENT, reason, age_ms)
         if age_ms > self._max_age_ms:
             reason = f"the newest track is {age_ms:.0f} ms old (limit {self._max_age_ms:.0f} ms)"
-            if silence_s * 1000 < self._max_age_ms and min(self._transits_ms, default=0.0) > self._max_age_ms:
-                reason += ", all of it on the way: are the clocks of both hosts synchronised?"
+            on_the_way_ms = self._latest.transit_ms or 0.0
+            if silence_s * 1000 < self._max_age_ms < on_the_way_ms:
+                reason += f", {on_the_way_ms:.0f} ms of it on the way: is the link slow?"
+                if self._latest.clock is None:
+                    reason += " Or do the clocks of both hosts differ? It could not be measured."
             return Health(Freshness.STALE, reason, age_ms)
         return Health(Freshness.FRESH, "", age_ms)
 
@@ -376,13 +475,20 @@ class Subscriber:
         shortest_s, longest_s = SILENT_AFTER_S
         return min(max(SILENT_PERIODS * statistics.median(self._periods_s), shortest_s), longest_s)
 
+    def _heartbeat_overdue_s(self) -> float | None:
+        """How long the heart of this daemon has been quiet, where that is too long; None where it never beat."""
+        if self._status is None or not self._status_monotonic_ns:
+            return None
+        quiet_s = (time.monotonic_ns() - self._status_monotonic_ns) / 1e9
+        limit_s = max(HEARTBEATS_MISSED * self._status.heartbeat_s, self._silent_after_s or 0.0)
+        return quiet_s if quiet_s > limit_s else None
+
     def _daemon_says(self) -> str:
         if self._unreadable_reason:
             return f"{self._undecodable} samples could not be read, the newest: {self._unreadable_reason}"
         if self._status is None:
             return "nor a heartbeat"
-        quiet_s = (time.monotonic_ns() - self._status_monotonic_ns) / 1e9
-        if quiet_s > HEARTBEATS_MISSED * self._status.heartbeat_s:
+        if (quiet_s := self._heartbeat_overdue_s()) is not None:
             return f"nor a heartbeat for {quiet_s:.1f} s: the daemon hangs, or the link does"
         error = f", its newest error: {self._status.last_error}" if self._status.last_error else ""
         return f"the daemon's heart beats ({self._status.state.value}){error}"
@@ -404,6 +510,39 @@ class Subscriber:
     def _rigs_alive(self) -> list[str]:
         replies = self._liveliness.get(f"{self.keys.prefix}/*/alive", timeout=1.0)
         return sorted({str(reply.ok.key_expr).split("/")[-2] for reply in replies if reply.ok is not None})
+
+
+def control(
+    rig: str,
+    request: ControlRequest,
+    connect: Sequence[str] = (DEFAULT_ENDPOINT,),
+    *,
+    key_prefix: str = DEFAULT_PREFIX,
+    timeout_s: float = 10.0,
+) -> ControlReply:
+    """Ask a rig's daemon for something, and return its answer, whose class belongs to the request's.
+
+    Asked again until an answer comes: the request's id sees to it that nothing is done twice. A refusal is an answer
+    (`outcome`). Raises PublishError where none comes in time, or it cannot be read.
+    """
+    keys = RigKeys(rig, key_prefix)
+    key, until_s = keys.control(request.command), time.monotonic() + timeout_s
+    reached = False
+    with open_session(connect=connect) as session:
+        while (left_s := until_s - time.monotonic()) > 0:
+            for reply in session.get(key, payload=request.to_json(), timeout=left_s):
+                if reply.ok is not None:
+                    return request.reply_from_json(reply.ok.payload.to_bytes())
+            reached = reached or bool(session.info.transports())
+            time.sleep(min(ASK_AGAIN_S, left_s))
+    where = " or ".join(connect)
+    if not reached:
+        raise PublishError(f"nobody answers at {where} within {timeout_s:g} s: is the daemon running, and there?")
+    raise PublishError(
+        f"{where} answers, but nobody on {key} within {timeout_s:g} s: check the rig's name and the key prefix; do the "
+        "access rules let this certificate ask? A replay takes no requests. What was asked may have been done all the "
+        "same: the same request, repeated, is answered with its outcome"
+    )
 
 
 def _pairs_dropped(message: TrackMessage) -> int:

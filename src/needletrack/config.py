@@ -11,7 +11,7 @@ import re
 import tomllib
 from functools import cached_property
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Self
 
 from annotated_types import Ge, Gt, Le
 from pydantic import (
@@ -22,18 +22,22 @@ from pydantic import (
     ConfigDict,
     Field,
     ValidationError,
+    field_validator,
+    model_validator,
 )
 from pydantic_settings import BaseSettings, EnvSettingsSource, SettingsConfigDict, SettingsError
 
 from needletrack.calibration.drift import DriftParameters
 from needletrack.capture.settings import CamerasSettings
 from needletrack.errors import ConfigError
+from needletrack.tracking.needle import Needle
 from needletrack.tracking.parameters import TrackingParameters
 from needletrack.validation import complaints, known_keys, nearest_key
 
 ENVIRONMENT_PREFIX = "NEEDLETRACK_"
 
 Positive = Annotated[float, Gt(0), AllowInfNan(False)]
+NotNegative = Annotated[float, Ge(0), AllowInfNan(False)]
 
 
 def _endpoint(text: str) -> str:
@@ -95,6 +99,66 @@ class RecordingConfig(BaseModel):
         1000, description="Recording pauses while the disk has less free than this, MB."
     )
     max_file_mb: Annotated[int, Ge(16)] = Field(8000, description="A new file is begun after so much, MB.")
+    at_start: bool = Field(True, description="Record from the daemon's start; false: when it is told to (control).")
+
+
+DEFAULT_NEEDLE = "default"
+
+
+class NeedleType(BaseModel):
+    """A needle that can be chosen while the daemon runs; what is left out is as in [tracking.needle]."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    name: Annotated[str, Field(pattern=r"^[A-Za-z0-9_.-]{1,64}$")] = Field(
+        description="Its name in a request: letters, digits, '_', '.' and '-'."
+    )
+    min_diameter_mm: Positive | None = Field(None, description="As in [tracking.needle], mm.")
+    max_diameter_mm: Positive | None = Field(None, description="As in [tracking.needle], mm.")
+    min_length_mm: Positive | None = Field(None, description="As in [tracking.needle], mm.")
+    max_length_mm: Positive | None = Field(None, description="As in [tracking.needle], mm.")
+    tip_tapers_mm: Annotated[tuple[NotNegative, ...], Field(min_length=1)] | None = Field(
+        None, description="As in [tracking.needle], mm."
+    )
+
+    @field_validator("name")
+    @classmethod
+    def _is_no_other(cls, name: str) -> str:
+        if name == DEFAULT_NEEDLE:
+            raise ValueError(f"{DEFAULT_NEEDLE!r} is the needle of [tracking.needle]: choose another name")
+        return name
+
+    def over(self, needle: Needle) -> Needle:
+        """This type, where it says nothing as the other one; raises ValueError where that cannot be."""
+        own = self.model_dump(exclude={"name"}, exclude_none=True)
+        return Needle.model_validate({**needle.model_dump(), **own})
+
+
+class ControlConfig(BaseModel):
+    """What may be asked of `needletrack run` while it runs, and by whom."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    enabled: bool = Field(
+        False, description="Take requests to record, to take a snapshot, to detect anew, to change the needle."
+    )
+    token_file: OptionalPath = Field(
+        None,
+        description="File with a secret that every request must bear, readable by its owner alone; empty: none is "
+        "asked for.",
+    )
+    snapshot_folder: OptionalPath = Field(None, description="Where snapshots go; empty: recording.folder.")
+    needles: tuple[NeedleType, ...] = Field(
+        (),
+        description="Needle types to change to, each a [[control.needles]]: name, and keys of [tracking.needle].",
+    )
+
+    @model_validator(mode="after")
+    def _names_differ(self) -> Self:
+        names = [needle.name for needle in self.needles]
+        if twice := sorted({name for name in names if names.count(name) > 1}):
+            raise ValueError(f"needles: {', '.join(twice)} twice")
+        return self
 
 
 class DaemonConfig(BaseModel):
@@ -147,14 +211,46 @@ class Config(BaseModel):
     cameras: CamerasSettings = Field(CamerasSettings(), description="The two cameras.")
     recording: RecordingConfig = Field(RecordingConfig(), description="Where recordings go.")
     daemon: DaemonConfig = Field(DaemonConfig(), description="How the daemon lives on its machine.")
+    control: ControlConfig = Field(ControlConfig(), description="What may be asked of it while it runs.")
+
+    @model_validator(mode="after")
+    def _needle_types_can_be(self) -> Self:
+        for needle in self.control.needles:
+            try:
+                needle.over(self.tracking.needle)
+            except ValidationError as error:
+                fault = error.errors(include_url=False)[0]["msg"].removeprefix("Value error, ")
+                raise ValueError(
+                    f"control.needles: {needle.name}, with what it leaves to tracking.needle: {fault}"
+                ) from error
+        return self
 
     @cached_property
     def digest(self) -> str:
         """Twelve hexadecimal digits (SHA-256) of every value that can change a track, but for the rig's path."""
-        # The rig has a digest of its own; where a recording goes and how the process is scheduled change no track.
-        values = self.model_dump(mode="json", exclude={"rig": {"path"}, "recording": True, "daemon": True})
+        # The rig has a digest of its own; where a recording goes, how the process is scheduled, and what it could be
+        # asked change no track.
+        values = self.model_dump(
+            mode="json", exclude={"rig": {"path"}, "recording": True, "daemon": True, "control": True}
+        )
         content = json.dumps(values, sort_keys=True)
         return hashlib.sha256(content.encode()).hexdigest()[:12]
+
+    def with_needle(self, name: str) -> "Config":
+        """The configuration with the needle type of this name in use; raises ConfigError for an unknown name."""
+        if name == DEFAULT_NEEDLE:
+            return self
+        whole = {needle.name: needle.over(self.tracking.needle) for needle in self.control.needles}
+        if name not in whole:
+            known = ", ".join([DEFAULT_NEEDLE, *whole])
+            raise ConfigError(f"no needle {name!r} in control.needles of the configuration: there are {known}")
+        # The types stay what they are: what they left out was said by the needle that is replaced.
+        types = tuple(NeedleType(name=other, **needle.model_dump()) for other, needle in whole.items())
+        values = {field: getattr(self, field) for field in Config.model_fields}
+        values["tracking"] = self.tracking.model_copy(update={"needle": whole[name]})
+        values["control"] = self.control.model_copy(update={"needles": types})
+        # Not by model_copy, which would keep the digest.
+        return Config.model_validate(values)
 
 
 def load_config(path: Path | str | None = None) -> Config:
@@ -233,14 +329,14 @@ def _merged(values: dict[str, Any], overrides: dict[str, Any]) -> dict[str, Any]
     return merged
 
 
-_PATHS = (("rig", "path"), ("recording", "folder"))
+_PATHS = (("rig", "path"), ("recording", "folder"), ("control", "token_file"), ("control", "snapshot_folder"))
 
 
 def _anchored(values: dict[str, Any], folder: Path) -> dict[str, Any]:
     """The same values with their paths made absolute."""
     anchored = dict(values)
     for table, key in _PATHS:
-        entries = values.get(table)
+        entries = anchored.get(table)
         if isinstance(entries, dict) and isinstance(entries.get(key), str) and entries[key]:
             anchored[table] = {**entries, key: folder / Path(entries[key]).expanduser()}
     return anchored

@@ -9,7 +9,7 @@ import threading
 import time
 from collections import Counter, deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from typing import NamedTuple, Protocol
 
@@ -74,14 +74,24 @@ class Arrival(NamedTuple):
     dropped: Mapping[DropReason, int]
 
 
+class _Orders(NamedTuple):
+    """How pairs are tracked from the next one on; number: those of another number have no memory in common."""
+
+    tracker: Tracker
+    run: RunContext
+    number: int
+
+
 @dataclass(frozen=True)
 class Surroundings:
-    """What a heartbeat says of cameras and recorder, beside what the loop itself knows."""
+    """What a heartbeat says of cameras, recorder, needle and control, beside what the loop itself knows."""
 
     cameras: Mapping[str, WireCamera] | None = None
     skew: WireSkew | None = None
     recording: WireRecording | None = None
     last_error: str | None = None
+    needle: str | None = None
+    counters: Mapping[str, int] = field(default_factory=dict)
 
 
 class Service:
@@ -108,7 +118,9 @@ class Service:
         surroundings: Callable[[], Surroundings] = Surroundings,
         in_threads: Callable[[str], None] = lambda name: None,
     ) -> None:
-        self._source, self._tracker, self._rig, self._run = source, tracker, rig, run
+        self._source, self._rig = source, rig
+        self._orders, self._ordering = _Orders(tracker, run, 0), threading.Lock()
+        self._taken_sequence: int | None = None
         self._every_frame, self._independent, self._heartbeat_s = every_frame, independent, heartbeat_s
         self._drift, self._max_age_days = drift or DriftParameters(), max_age_days
         self._surroundings, self._in_threads = surroundings, in_threads
@@ -140,19 +152,47 @@ class Service:
         since_s = self._busy_since_s
         return 0.0 if since_s is None else time.monotonic() - since_s
 
+    def forget(self) -> int | None:
+        """Track without memory from the next pair on; never waits for the worker.
+
+        The sequence of the last pair that was taken up before (None: none was): later ones are tracked so.
+        """
+        with self._ordering:
+            self._orders = self._orders._replace(number=self._orders.number + 1)
+            return self._taken_sequence
+
+    def use(self, tracker: Tracker, config_digest: str) -> int | None:
+        """Track with another tracker, without memory, from the next pair on, whose message bears the digest.
+
+        Never waits for the worker. The sequence of the last pair that was taken up before, as of `forget`.
+        """
+        with self._ordering:
+            run = replace(self._orders.run, config_digest=config_digest)
+            self._orders = _Orders(tracker, run, self._orders.number + 1)
+            return self._taken_sequence
+
+    def _taken_up(self, sequence: int) -> _Orders:
+        with self._ordering:
+            self._taken_sequence = sequence
+            return self._orders
+
     def run(self, sinks: Sequence[Sink], stop: threading.Event) -> RunSummary:
         """Track until the source ends or `stop` is set; the first exception of any thread ends the run, raised here."""
         self._state = ServiceState.RUNNING
         started_s = time.monotonic()
         tracking_ms: deque[float] = deque(maxlen=_TIMES_KEPT)
         previous: NeedleTrack | None = None
+        followed = self._orders.number
         drift = DriftState()
         self._in_threads("tracking")
         try:
             for pair, dropped in self._every_pair(stop) if self._every_frame else self._newest_pairs(stop):
                 self._busy_since_s = time.monotonic()
                 began_ns = time.monotonic_ns()
-                track = self._tracker(pair, None if self._independent else previous)
+                orders = self._taken_up(pair.sequence)
+                if self._independent or orders.number != followed:
+                    previous, followed = None, orders.number
+                track = orders.tracker(pair, previous)
                 tracked_ms = (time.monotonic_ns() - began_ns) / 1e6
                 tracking_ms.append(tracked_ms)
                 # What is published may be doubted; the next pair is tracked from the track itself.
@@ -166,7 +206,7 @@ class Service:
                 message = TrackMessage.from_track(
                     in_published_frame(track, self._rig.registration),
                     pair,
-                    self._run,
+                    orders.run,
                     dropped=dropped,
                     published=Instant.now(),
                     parts_ms={**_before_tracking_ms(pair, began_ns), "track": tracked_ms},
@@ -195,7 +235,7 @@ class Service:
         )
         around = self._surroundings()
         return StatusMessage.from_run(
-            self._run,
+            self._orders.run,
             state=self._state,
             heartbeat_s=self._heartbeat_s,
             published_at_ns=time.time_ns(),
@@ -204,11 +244,12 @@ class Service:
             calibration=_calibration(self._rig, self._max_age_days),
             rates=rates,
             dropped=self.dropped,
-            counters={f"tracks_{status.value}": done[status] for status in Status},
+            counters={f"tracks_{status.value}": done[status] for status in Status} | dict(around.counters),
             last_error=around.last_error,
             cameras=around.cameras,
             skew=around.skew,
             recording=around.recording,
+            needle=around.needle,
         )
 
     def _every_pair(self, stop: threading.Event) -> Iterator[Arrival]:

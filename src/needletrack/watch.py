@@ -25,6 +25,8 @@ DRAW_PERIOD_S = 0.1
 LINE_PERIOD_S = 1.0
 RATE_OVER_S = 1.0
 LATENCIES_REMEMBERED = 10_000
+# A person looks, and no robot moves: a slow replay need not flicker.
+MAX_AGE_S = 0.2
 # What was sent before the daemon went may still be on its way through this process.
 LAST_TRACKS_S = 0.2
 
@@ -86,17 +88,18 @@ def watch(
     until_gone: bool = False,
     count: int | None = None,
     wait_s: float | None = None,
+    max_age_s: float = MAX_AGE_S,
     stop: threading.Event | None = None,
     console: Console | None = None,
 ) -> WatchSummary:
     """Show a rig's tracks until Ctrl-C, `stop`, `count` tracks, or (until_gone) until the daemon has gone.
 
     On a terminal a panel, drawn ten times a second; elsewhere a line a second. Raises PublishError where
-    the daemon is not there within wait_s (None: wait for ever).
+    the daemon is not there within wait_s (None: wait for ever). max_age_s: an older track is shown as stale.
     """
     console = console or Console()
     stop = stop or threading.Event()
-    with Subscriber(rig, connect, key_prefix=key_prefix) as subscriber:
+    with Subscriber(rig, connect, key_prefix=key_prefix, max_age_s=max_age_s) as subscriber:
         if wait_s is not None:
             subscriber.wait_for_daemon(wait_s)
         tally = _Tally(subscriber, where=" ".join(connect))
@@ -181,6 +184,7 @@ class _Tally:
             f"latency {_number(self._newest.latency_ms, 1)} ms",
             f"dropped {self._dropped}",
             f"lost {self._lost}",
+            f"clock {self._clock()}",
             state,
         )
         return "  ".join(parts)
@@ -206,6 +210,7 @@ class _Tally:
         age = "" if health.age_ms is None else f"   {health.age_ms:.0f} ms old"
         reason = f"   {health.reason}" if health.reason else ""
         rows.add_row("link", Text(f"{health.state.value}{age}{reason}", style=HEALTH_STYLE[health.state]))
+        rows.add_row("clock", self._clock())
         if (status := self._subscriber.status) is not None:
             rows.add_row("daemon", _daemon(status))
         return Panel(rows, title=f"needletrack · {self._subscriber.keys.rig}", subtitle=self._where, title_align="left")
@@ -223,6 +228,10 @@ class _Tally:
 
     def _shares(self) -> str:
         return "   ".join(f"{count} {status}" for status, count in sorted(self._statuses.items()))
+
+    def _clock(self) -> str:
+        clock = self._subscriber.clock
+        return "not compared" if clock is None else str(clock)
 
     def _missed(self) -> str:
         reasons = ""

@@ -68,6 +68,11 @@ def test_a_later_field_and_a_later_reason_pass_the_schema() -> None:
     validator("track").validate(later)
 
 
+def test_every_table_of_the_page_is_made_from_a_model() -> None:
+    named = set(re.findall(r"<!-- generated: ([a-z ]+) -->", PAGE.read_text(encoding="utf-8")))
+    assert named == {*schema.TABLES, *schema.ANSWERS, "reasons", "control codes"}
+
+
 def test_every_kind_of_track_passes_the_schema() -> None:
     track, pair = schema.example_track(points=20)
     stamp = pair.captured_at_ns

@@ -5,6 +5,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -225,3 +226,67 @@ def test_an_idle_recorder_has_everything_on_the_disk(tmp_path: Path) -> None:
         recorder.offer(pair(0))
         wait_for(lambda: file.exists() and file.stat().st_size > 6000)
         assert recover(file, tmp_path / "saved.mcap").pairs == 1
+
+
+def tracked(recorder: Recorder, number: int) -> TrackMessage:
+    offered = pair(number)
+    recorder.offer(offered)
+    track, told = message(offered)
+    recorder.take(offered, track, told)
+    return told
+
+
+def test_begun_and_ended_at_will_each_recording_is_a_file_of_its_own(tmp_path: Path) -> None:
+    with Recorder(RecorderSettings(tmp_path), ABOUT, SIZE_PX, begun=False) as recorder:
+        assert not recorder.begun
+        tracked(recorder, 0)
+        assert list(tmp_path.glob("*.mcap")) == []
+        assert not recorder.end(WAIT_S)
+        kept = []
+        for first in (1, 11):
+            assert recorder.begin()
+            assert not recorder.begin()
+            kept.append([tracked(recorder, number) for number in range(first, first + 5)])
+            assert recorder.end(WAIT_S)
+            # Finished: readable by its index while the daemon goes on.
+            assert len(McapRecording(Path(recorder.state.file))) == 5
+            assert (recorder.begun, recorder.state.is_open) == (False, False)
+            tracked(recorder, first + 5)
+        assert (recorder.offered, recorder.recorded, recorder.dropped) == (10, 10, 0)
+    files = sorted(tmp_path.glob("*.mcap"), key=lambda file: file.stat().st_mtime_ns)
+    assert len(files) == 2
+    for file, messages in zip(files, kept, strict=True):
+        recording = McapRecording(file)
+        assert [told for _, told in recording.tracks()] == [told.to_json() for told in messages]
+        assert recording.about.exposure_ns == 2 * MS
+
+
+def test_an_end_waits_for_the_tracks_of_its_last_pairs(tmp_path: Path) -> None:
+    with Recorder(RecorderSettings(tmp_path), ABOUT, SIZE_PX) as recorder:
+        offered = pair(0)
+        recorder.offer(offered)
+        track, told = message(offered)
+        late = threading.Timer(0.05, recorder.take, (offered, track, told))
+        late.start()
+        assert recorder.end(WAIT_S)
+        late.join()
+        assert [line for _, line in McapRecording(Path(recorder.state.file)).tracks()] == [told.to_json()]
+
+
+def test_what_a_file_says_of_itself_can_change_on_the_way(tmp_path: Path) -> None:
+    with Recorder(RecorderSettings(tmp_path), ABOUT, SIZE_PX) as recorder:
+        tracked(recorder, 0)
+        recorder.renew(replace(ABOUT, config='{"another": 1}'))
+        tracked(recorder, 1)
+    files = sorted(tmp_path.glob("*.mcap"), key=lambda file: file.name.rsplit("-", 1)[1])
+    assert [McapRecording(file).about.config for file in files] == ["{}", '{"another": 1}']
+    assert [len(McapRecording(file)) for file in files] == [1, 1]
+
+
+def test_an_end_of_a_recorder_that_is_gone_is_told(tmp_path: Path) -> None:
+    with Recorder(RecorderSettings(tmp_path), ABOUT, SIZE_PX) as recorder:
+        tracked(recorder, 0)
+        assert recorder.pid is not None
+        os.kill(recorder.pid, signal.SIGKILL)
+        with pytest.raises(RecordingError, match="the recorder has ended"):
+            recorder.end(WAIT_S)

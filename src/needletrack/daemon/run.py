@@ -17,11 +17,14 @@ from needletrack.capture.live import LiveSource
 from needletrack.capture.pairing import SkewReport
 from needletrack.capture.source import FrameSource
 from needletrack.config import Config
+from needletrack.daemon.control import Operator, authority
 from needletrack.daemon.metrics import Metrics
 from needletrack.daemon.process import AlreadyRunning, OnlyInstance, lock_memory, schedule_thread, settle_memory
 from needletrack.daemon.record import both_cameras
 from needletrack.daemon.systemd import Notifier
 from needletrack.errors import CaptureError, ConfigError
+from needletrack.publish.control import ControlDesk
+from needletrack.publish.keys import RigKeys
 from needletrack.publish.message import RunContext, Source, TrackMessage, WireCamera, WireRecording, WireSkew
 from needletrack.publish.publisher import ZenohPublisher
 from needletrack.recording.mcap_file import About
@@ -90,6 +93,8 @@ class Daemon:
         self.context = RunContext(rig.name, Source.LIVE, config.digest, rig.digest, frame_id=rig.frame_id)
         self._cameras = both_cameras(config, kernel)
         self._recorder: Recorder | None = None
+        self._operator: Operator | None = None
+        self._desk: ControlDesk | None = None
         self.service: Service | None = None
 
     def run(self, stop: threading.Event, *, ready: Callable[[], None] = lambda: None) -> DaemonSummary:
@@ -100,11 +105,17 @@ class Daemon:
         config, rig = self.config, self.rig
         with ExitStack() as opened:
             opened.enter_context(OnlyInstance(rig.name))
+            may_control = authority(config.control)
             notifier = Notifier()
             opened.callback(notifier.close)
             source: FrameSource = self._cameras
             if config.recording.folder is not None:
-                self._recorder = Recorder(_recorder_settings(config), self._about(), config.cameras.size_px)
+                self._recorder = Recorder(
+                    _recorder_settings(config),
+                    self._about(config),
+                    config.cameras.size_px,
+                    begun=config.recording.at_start,
+                )
                 opened.callback(self._recorder.close, _RECORDER_ENDS_WITHIN_S)
                 source = RecordedSource(source, self._recorder)
             tracker = opened.enter_context(AuditedTracker(rig, config.tracking))
@@ -119,19 +130,25 @@ class Daemon:
                 surroundings=self.surroundings,
                 in_threads=self._in_thread,
             )
-            publisher = opened.enter_context(self._publisher(service))
+            operator = self._operator = Operator(
+                rig, config, service, self._recorder, tracker_of=tracker_of, about=self._about
+            )
+            keys = RigKeys(rig.name, config.publishing.key_prefix)
+            desk = self._desk = ControlDesk(self.context, keys, operator.handlers, may_control)
+            publisher = opened.enter_context(self._publisher(service, desk))
             metrics = opened.enter_context(Metrics(service, self.surroundings, config.daemon.metrics_port))
             if config.daemon.lock_memory:
                 lock_memory()
             warm_up(tracker, rig)
             settle_memory()
             opened.enter_context(_Pulse(notifier, service, self._cameras))
+            opened.enter_context(desk)
             notifier.ready("waiting for both cameras")
             ready()
             if warning := rig.age_warning(config.rig.max_age_days, datetime.now(UTC)):
                 _log.warning("%s", warning)
             _log.info("the daemon runs", extra={"rig_digest": rig.digest, "config_digest": config.digest})
-            sinks: list[Sink] = [_Published(publisher), metrics]
+            sinks: list[Sink] = [_Published(publisher), metrics, operator.newest]
             if self._recorder is not None:
                 sinks.append(self._recorder)
             run = service.run(sinks, stop)
@@ -151,7 +168,7 @@ class Daemon:
         }
         recording, recorder = None, self._recorder
         last_error = self._cameras.last_error
-        if recorder is not None:
+        if recorder is not None and recorder.begun:
             state = recorder.state
             recording = WireRecording(
                 file=state.file,
@@ -162,9 +179,11 @@ class Daemon:
             )
             last_error = state.error or last_error
         skew = WireSkew.model_validate(asdict(self._cameras.skew))
-        return Surroundings(cameras, skew, recording, last_error)
+        needle = None if self._operator is None else self._operator.needle
+        counters = {} if self._desk is None else {f"control_{name}": n for name, n in self._desk.counts.items()}
+        return Surroundings(cameras, skew, recording, last_error, needle, counters)
 
-    def _publisher(self, service: Service) -> ZenohPublisher:
+    def _publisher(self, service: Service, desk: ControlDesk) -> ZenohPublisher:
         settings = self.config.publishing
         return ZenohPublisher(
             self.context,
@@ -173,10 +192,11 @@ class Daemon:
             connect=settings.connect,
             key_prefix=settings.key_prefix,
             heartbeat_s=settings.heartbeat_s,
+            control=desk.receive,
         )
 
-    def _about(self) -> About:
-        return About(self.rig, self.rig.name, self.context.run_id, self.config.model_dump_json())
+    def _about(self, config: Config) -> About:
+        return About(self.rig, self.rig.name, self.context.run_id, config.model_dump_json())
 
     def _in_thread(self, name: str) -> None:
         settings = self.config.daemon

@@ -25,7 +25,7 @@ def checked_chunk(name: str, what: str) -> str:
 
 @dataclass(frozen=True)
 class RigKeys:
-    """The three keys of one rig, `<prefix>/<rig>/{track,status,alive}`.
+    """The keys of one rig, `<prefix>/<rig>/{track,status,alive,clock}` and `<prefix>/<rig>/control/<command>`.
 
     Raises PublishError where rig or prefix cannot be part of a Zenoh key; only the prefix may hold '/'.
     """
@@ -52,3 +52,12 @@ class RigKeys:
     def alive(self) -> str:
         """The liveliness token of the daemon."""
         return f"{self.prefix}/{self.rig}/alive"
+
+    @property
+    def clock(self) -> str:
+        """Answers queries with the time of the daemon's clock."""
+        return f"{self.prefix}/{self.rig}/clock"
+
+    def control(self, command: str) -> str:
+        """Answers queries that ask for something to be done; command: its name, or * for all."""
+        return f"{self.prefix}/{self.rig}/control/{command}"

@@ -102,7 +102,10 @@ class Instant:
 class WirePart(BaseModel):
     """A part of a message: frozen, finite numbers only, unknown fields ignored."""
 
-    model_config = ConfigDict(frozen=True, extra="ignore", allow_inf_nan=False)
+    # A field that came within version 1 has a default, for readers of an older daemon; every daemon sends it.
+    model_config = ConfigDict(
+        frozen=True, extra="ignore", allow_inf_nan=False, json_schema_serialization_defaults_required=True
+    )
 
 
 class WireTip(WirePart):
@@ -395,6 +398,9 @@ class StatusMessage(WirePart):
     cameras: Mapping[str, WireCamera] | None = Field(description="left and right; null in a replay")
     skew: WireSkew | None = Field(description="what both cameras' stamps say of each other; null in a replay")
     recording: WireRecording | None = Field(description="null where nothing is recorded")
+    needle: str | None = Field(
+        None, description="type in use: `default` or one of `control.needles`; null in a replay, and where unknown"
+    )
 
     @classmethod
     def from_run(
@@ -414,6 +420,7 @@ class StatusMessage(WirePart):
         cameras: Mapping[str, WireCamera] | None = None,
         skew: WireSkew | None = None,
         recording: WireRecording | None = None,
+        needle: str | None = None,
     ) -> Self:
         """The heartbeat of a run; what is left out is null, zero or empty."""
         return cls(
@@ -438,6 +445,7 @@ class StatusMessage(WirePart):
             cameras=cameras,
             skew=skew,
             recording=recording,
+            needle=needle,
         )
 
     @classmethod

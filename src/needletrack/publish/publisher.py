@@ -1,6 +1,7 @@
 """The daemon's side of the wire: one Zenoh peer that publishes tracks, heartbeats and its liveliness."""
 
 import threading
+import time
 import weakref
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
@@ -10,6 +11,7 @@ from typing import Self
 import zenoh
 
 from needletrack.errors import PublishError
+from needletrack.publish.clock import CLOCK_ENCODING, ClockMessage
 from needletrack.publish.keys import DEFAULT_PREFIX, STATUS_ENCODING, TRACK_ENCODING, RigKeys
 from needletrack.publish.message import RunContext, StatusMessage, TrackMessage
 from needletrack.publish.session import DEFAULT_ENDPOINT, direct, open_session
@@ -22,7 +24,7 @@ class ZenohPublisher:
 
     status is called once a heartbeat, from this object's own thread, and once more on closing. Raises
     PublishError where an endpoint is taken or malformed. An error of `status` is raised by the next
-    `publish` or by `close`.
+    `publish` or by `close`. control: takes the queries below `control/`, in Zenoh's thread; None answers none.
     """
 
     def __init__(
@@ -34,6 +36,7 @@ class ZenohPublisher:
         connect: Sequence[str] = (),
         key_prefix: str = DEFAULT_PREFIX,
         heartbeat_s: float = DEFAULT_HEARTBEAT_S,
+        control: Callable[[zenoh.Query], None] | None = None,
     ) -> None:
         self.keys = RigKeys(run.rig, key_prefix)
         self._status = status
@@ -45,6 +48,8 @@ class ZenohPublisher:
         with ExitStack() as opened:
             session = opened.enter_context(open_session(listen, connect))
             self._declare(session)
+            if control is not None:
+                session.declare_queryable(self.keys.control("*"), direct(control))
             # Last, and so first to go: whoever sees the token can query, and gets the last heartbeat.
             opened.enter_context(session.liveliness().declare_token(self.keys.alive))
             # A program that ends without `close` closes the session all the same.
@@ -70,6 +75,7 @@ class ZenohPublisher:
             priority=zenoh.Priority.DATA_LOW,
         )
         session.declare_queryable(self.keys.status, direct(self._on_status_query), complete=True)
+        session.declare_queryable(self.keys.clock, direct(self._on_clock_query), complete=True)
 
     def publish(self, message: TrackMessage) -> None:
         """Send one track; it is dropped where nobody listens or a link is full.
@@ -126,6 +132,14 @@ class ZenohPublisher:
     def _on_status_query(self, query: zenoh.Query) -> None:
         with query:
             query.reply(self.keys.status, self._status_json, encoding=STATUS_ENCODING)
+
+    def _on_clock_query(self, query: zenoh.Query) -> None:
+        received_at_ns = time.time_ns()
+        with query:
+            # Only who asks for it by name: somebody who looks at all keys wants no time.
+            if str(query.key_expr) == self.keys.clock:
+                answer = ClockMessage.now(received_at_ns, time.time_ns())
+                query.reply(self.keys.clock, answer.to_json(), encoding=CLOCK_ENCODING)
 
     def _on_matching(self, matching: zenoh.MatchingStatus) -> None:
         if matching.matching:

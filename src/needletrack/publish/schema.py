@@ -17,6 +17,17 @@ from needletrack.capture.live import CameraState
 from needletrack.capture.pairing import Trigger
 from needletrack.errors import PublishError
 from needletrack.geometry.transform import orientation_along
+from needletrack.publish.clock import ClockMessage
+from needletrack.publish.control import (
+    CONTROL_CODE_MEANING,
+    ControlReply,
+    NeedleReply,
+    NeedleRequest,
+    RedetectReply,
+    SnapshotReply,
+    StartRecordingReply,
+    StopRecordingReply,
+)
 from needletrack.publish.message import (
     Instant,
     RunContext,
@@ -60,6 +71,17 @@ TABLES: dict[str, type[WirePart]] = {
     "camera fields": WireCamera,
     "skew fields": WireSkew,
     "recording fields": WireRecording,
+    "clock fields": ClockMessage,
+    "control request": NeedleRequest,
+    "control answer": ControlReply,
+}
+# What each answer has beside what all of them have.
+ANSWERS: dict[str, type[ControlReply]] = {
+    "start recording answer": StartRecordingReply,
+    "stop recording answer": StopRecordingReply,
+    "snapshot answer": SnapshotReply,
+    "redetect answer": RedetectReply,
+    "needle answer": NeedleReply,
 }
 _GENERATED = re.compile(r"(?<=<!-- generated: )([a-z ]+)( -->\n).*?(?=<!-- end -->)", re.DOTALL)
 
@@ -139,12 +161,13 @@ def example_messages() -> tuple[TrackMessage, StatusMessage]:
         ),
         rates=WireRates(pairs_per_s=60.0, tracks_per_s={"ok": 59.4, "degraded": 0.4, "invalid": 0.2}),
         dropped=dropped,
-        counters={"pairs": 1208},
+        counters={"control_done": 1, "control_failed": 0, "control_refused": 0, "tracks_ok": 1196},
         cameras={side: _example_camera(number) for number, side in enumerate(("left", "right"))},
         skew=WireSkew(offset_us=12.0, spread_us=9.0, drift_ppm=0.1, drift_sigma_ppm=0.2, looks=Trigger.HARDWARE.value),
         recording=WireRecording(
             file="/data/lab-20260528T202640-0.mcap", pairs=1208, dropped=0, megabytes=1913.4, error=None
         ),
+        needle="default",
     )
     return message, status
 
@@ -196,10 +219,15 @@ def _table(name: str) -> str:
     if name == "reasons":
         rows = [f"| `{reason.value}` | {meaning} |" for reason, meaning in REASON_MEANING.items()]
         return "\n".join(["| code | meaning |", "|---|---|", *rows])
-    schema = TABLES[name].model_json_schema(mode="serialization")
+    if name == "control codes":
+        rows = [f"| `{code.value}` | {meaning} |" for code, meaning in CONTROL_CODE_MEANING.items()]
+        return "\n".join(["| code | meaning |", "|---|---|", *rows])
+    model = ANSWERS[name] if name in ANSWERS else TABLES[name]
+    schema = model.model_json_schema(mode="serialization")
     rows = [
         f"| `{field}` | {_type_name(part, schema)} | {part.get('description', '')} |"
         for field, part in schema["properties"].items()
+        if name not in ANSWERS or field not in ControlReply.model_fields
     ]
     return "\n".join(["| field | type | meaning |", "|---|---|---|", *rows])
 

@@ -42,6 +42,8 @@ _RETRY_AFTER_S = 5.0
 _WARN_EVERY_S = 5.0
 _MB = 1_000_000
 _NICE = -10
+_TRACKS_FOLLOW_WITHIN_S = 0.3
+_LOOK_EVERY_S = 0.01
 # <malloc.h>
 _M_TRIM_THRESHOLD, _M_TOP_PAD, _M_MMAP_THRESHOLD = -1, -2, -3
 
@@ -63,12 +65,16 @@ class RecorderSettings:
 
 @dataclass(frozen=True, slots=True)
 class RecorderState:
-    """What was recorded so far, by the last that the writing process said; error: why it pauses, or None."""
+    """What was recorded so far, by the last that the writing process said.
+
+    error: why it pauses, or None; is_open: whether the file is being written.
+    """
 
     file: str = ""
     pairs: int = 0
     megabytes: float = 0.0
     error: str | None = None
+    is_open: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,6 +94,11 @@ class _Track:
 
 
 @dataclass(frozen=True, slots=True)
+class _Finish:
+    number: int
+
+
+@dataclass(frozen=True, slots=True)
 class _Stop:
     at_s: float
 
@@ -97,16 +108,20 @@ class _Freed:
     slot: int
     recorded: bool
     state: RecorderState | None
+    finished: int = 0
 
 
 class Recorder:
     """Records pairs and their tracks; `offer` returns at once whatever the disk does, and counts what it cannot take.
 
     size_px: of the images. about: what the file says of itself; clock, exposure and place of the stamp are those of the
-    first pair. Raises RecordingError where the folder or file cannot be written.
+    first pair. begun: record from now on, else from `begin`. Raises RecordingError where the folder or file cannot be
+    written.
     """
 
-    def __init__(self, settings: RecorderSettings, about: About, size_px: tuple[int, int]) -> None:
+    def __init__(
+        self, settings: RecorderSettings, about: About, size_px: tuple[int, int], *, begun: bool = True
+    ) -> None:
         _require_writable(settings)
         self._about, self._shape = about, (2, size_px[1], size_px[0])
         bytes_a_pair = 2 * size_px[0] * size_px[1]
@@ -115,9 +130,15 @@ class Recorder:
         self._slots: Any = np.ndarray((slots, *self._shape), np.uint8, self._memory.buf)
         self._free = deque(range(slots))
         self._state, self._first, self._warned_s = RecorderState(), True, 0.0
+        # Between the thread that offers and the one that begins and ends; held for an image's copy at most.
+        self._turn = threading.Lock()
+        self._begun, self._ended, self._finished = begun, 0, 0
+        # The pairs of this recording: tracks of others do not belong into its file.
+        self._first_sequence: int | None = None
+        self._last_sequence = self._last_track = -1
         self.offered = self.recorded = self.dropped = self.dropped_tracks = 0
         context = multiprocessing.get_context("spawn")
-        self._commands: multiprocessing.Queue[_Pair | _Track | _Stop] = context.Queue(slots + _TRACKS_WAITING)
+        self._commands: multiprocessing.Queue[_Pair | _Track | _Finish | _Stop] = context.Queue(slots + _TRACKS_WAITING)
         self._returns, theirs = context.Pipe(duplex=False)
         self._process = context.Process(
             target=_record,
@@ -144,10 +165,87 @@ class Recorder:
         """What was recorded so far."""
         return self._state
 
+    @property
+    def begun(self) -> bool:
+        """Whether pairs are recorded now, or would be if the disk took them."""
+        return self._begun
+
+    def begin(self, about: About | None = None) -> bool:
+        """Record from the next pair on, into a new file; False where it records already. about: of the file."""
+        with self._turn:
+            if self._begun or self._closed:
+                return False
+            self._about = about or self._about
+            self._begun, self._first, self._first_sequence = True, True, None
+            return True
+
+    def end(self, timeout_s: float) -> bool:
+        """Record no more, and wait at most so long until the file is finished; False where nothing was being recorded.
+
+        Raises RecordingError where the disk does not let it be finished, or not in time: then it will be later.
+        """
+        until_s = time.monotonic() + timeout_s
+        with self._turn:
+            if not self._begun or self._closed:
+                return False
+            self._begun = False
+            last, offered = self._last_sequence, self._first_sequence is not None
+        # The last pairs are still with the tracker.
+        tracks_until_s = min(time.monotonic() + _TRACKS_FOLLOW_WITHIN_S, until_s)
+        while offered and self._last_track < last and time.monotonic() < tracks_until_s:
+            time.sleep(_LOOK_EVERY_S)
+        with self._turn:
+            if self._closed:
+                return True
+            self._ended += 1
+            self._first_sequence = None
+            wanted = self._ended
+            self._finish(wanted)
+        while time.monotonic() < until_s:
+            with self._turn:
+                if self._closed:
+                    return True
+                self._collect()
+                if self._finished >= wanted:
+                    if self._state.error is not None:
+                        raise RecordingError(self._state.error)
+                    return True
+                if not self._process.is_alive():
+                    raise RecordingError("the recorder has ended: `needletrack recover` saves the file")
+            time.sleep(_LOOK_EVERY_S)
+        raise RecordingError(self._state.error or "the disk is too slow: the file is not finished yet")
+
+    def renew(self, about: About) -> None:
+        """What files say of themselves from now on; the present one is finished, the next pair begins another.
+
+        Tracks of the last pairs before, which are still with the tracker, are in neither. Raises RecordingError where
+        the disk does not keep up.
+        """
+        with self._turn:
+            self._about = about
+            if self._begun and not self._closed:
+                self._first, self._first_sequence = True, None
+                self._ended += 1
+                self._finish(self._ended)
+
+    def _finish(self, number: int) -> None:
+        try:
+            self._commands.put_nowait(_Finish(number))
+        except queue.Full as full:
+            raise RecordingError("the disk is too slow: the file is not finished") from full
+
     def offer(self, pair: StereoPair) -> bool:
         """Take a pair, or count it as dropped: the memory is full, or recording pauses. One thread at a time."""
+        with self._turn:
+            if not self._closed:
+                self._collect()
+            return self._begun and self._taken(pair)
+
+    def _taken(self, pair: StereoPair) -> bool:
         self.offered += 1
-        self._collect()
+        if self._first_sequence is None:
+            self._first_sequence = pair.sequence
+        self._last_sequence = pair.sequence
         fits = pair.left.image.shape == pair.right.image.shape == self._shape[1:]
         if self._closed or not self._free or not fits or not self._process.is_alive():
             self.dropped += 1
@@ -167,7 +265,11 @@ class Recorder:
         return True
 
     def take(self, pair: StereoPair, track: NeedleTrack, message: TrackMessage) -> None:
-        """Record a published message; counts it where there is no place."""
+        """Record the message of a pair that was offered to this recording; counts it where there is no place."""
+        first = self._first_sequence
+        if first is None or not first <= message.sequence <= self._last_sequence:
+            return
+        self._last_track = message.sequence
         try:
             self._commands.put_nowait(_Track(message.sequence, message.captured_at_ns, message.to_json()))
         except (queue.Full, ValueError):
@@ -175,12 +277,13 @@ class Recorder:
 
     def close(self, timeout_s: float = 0.7) -> None:
         """Write what waits for at most so long, count the rest as dropped, finish the file; may be called twice."""
-        if self._closed:
-            return
-        self._closed = True
-        with suppress(queue.Full):
-            self._commands.put_nowait(_Stop(time.monotonic() + timeout_s))
-        self._commands.close()
+        with self._turn:
+            if self._closed:
+                return
+            self._closed = True
+            with suppress(queue.Full):
+                self._commands.put_nowait(_Stop(time.monotonic() + timeout_s))
+            self._commands.close()
         until_s = time.monotonic() + timeout_s + 0.2
         while self._process.is_alive() and time.monotonic() < until_s:
             # Its answers are taken meanwhile: a full pipe would hold it up.
@@ -225,6 +328,7 @@ class Recorder:
                 freed: _Freed = self._returns.recv()
                 if freed.state is not None:
                     self._say(freed.state)
+                self._finished = max(self._finished, freed.finished)
                 if freed.slot >= 0:
                     self._free.append(freed.slot)
                     self.recorded += freed.recorded
@@ -265,7 +369,7 @@ def _record(
     about: About,
     memory_name: str,
     shape: tuple[int, ...],
-    commands: "multiprocessing.Queue[_Pair | _Track | _Stop]",
+    commands: "multiprocessing.Queue[_Pair | _Track | _Finish | _Stop]",
     returns: Connection,
 ) -> None:
     """The writing process."""
@@ -300,6 +404,10 @@ def _record(
                 stop_at_s = command.at_s
             elif isinstance(command, _Track):
                 files.add_track(command)
+            elif isinstance(command, _Finish):
+                files.end()
+                with suppress(BrokenPipeError):
+                    returns.send(_Freed(-1, recorded=False, state=files.state, finished=command.number))
             else:
                 before = files.state
                 recorded = files.add_pair(command, slots[command.slot, 0], slots[command.slot, 1])
@@ -370,10 +478,17 @@ class _Files:
         try:
             self._writer.finish()
             self._count()
+            self.state = replace(self.state, is_open=False)
         except OSError as error:
             self._writer.abandon()
             self._pause(_unwritable(self._writer.path, error))
         self._writer = None
+
+    def end(self) -> None:
+        """Finish, and forget what kept the disk from taking it: the next recording tries anew, and at once."""
+        self._retry_at_s = self._looked_at_s = 0.0
+        self.state = replace(self.state, error=None)
+        self.finish()
 
     def _attempt(self, write: Callable[[PairWriter], None]) -> bool:
         now_s = time.monotonic()
@@ -412,7 +527,7 @@ class _Files:
     def _count(self) -> None:
         assert self._writer is not None
         pairs, size = self._done + self._writer.pairs, self._bytes_done + self._writer_bytes()
-        self.state = RecorderState(str(self._writer.path), pairs, round(size / _MB, 1))
+        self.state = RecorderState(str(self._writer.path), pairs, round(size / _MB, 1), is_open=True)
 
     def _writer_bytes(self) -> int:
         assert self._writer is not None
@@ -422,7 +537,7 @@ class _Files:
 
     def _pause(self, error: str) -> None:
         self._retry_at_s = time.monotonic() + _RETRY_AFTER_S
-        self.state = replace(self.state, error=error)
+        self.state = replace(self.state, error=error, is_open=False)
 
     def _sync(self, now_s: float) -> None:
         """Have the disk keep what the kernel has, once a second, in a thread: it may take that long."""

@@ -78,7 +78,10 @@ class AuditedTracker:
     def warm_up(self) -> None:
         """Wait until the second process is there."""
         if self._auditor is not None:
-            self._auditor.wait(_STARTS_WITHIN_S)
+            try:
+                self._auditor.wait(_STARTS_WITHIN_S)
+            except (EOFError, OSError):
+                self._give_up()
 
     def __call__(self, pair: StereoPair, previous: NeedleTrack | None) -> NeedleTrack:
         """The track of this pair; previous: that of the pair before, None to start without memory."""

@@ -84,8 +84,9 @@ _MOST_CONTROL = 30
 # The tip shows its angle to the line of sight over so many points.
 _TIP_POINTS = 8
 # What the kernel says; 0: found.
-_FOUND, _BEYOND, _CLIPPED = 0, 1, 7
+_FOUND, _CLIPPED = 0, 7
 _LOST = {
+    1: Reason.JUMP,
     2: Reason.LOW_COVERAGE,
     3: Reason.HIGH_UNCERTAINTY,
     4: Reason.TOO_SHORT,
@@ -136,9 +137,9 @@ class Glance:
 
 
 def glance(images: Images, rig: StereoRig, steady: Steady, parameters: GlanceParameters) -> Glance | None:
-    """The needle where it was moved to since; raises NeedleNotFound where the views do not show it.
+    """The needle where it was moved to since; None where it is so bright that it is white.
 
-    None where its tip lies beyond what was looked at, or where it is so bright that it is white.
+    Raises NeedleNotFound where the views do not show it, or its tip has gone further than was looked.
     """
     shaft = replace(steady.appearance, taper_mm=None)
     wanted, kept = _wanted(parameters, shaft)
@@ -165,7 +166,7 @@ def glance(images: Images, rig: StereoRig, steady: Steady, parameters: GlancePar
     room = len(points_mm) + round((MOST_ADVANCE_MM + 2 * _BEYOND_MM) / parameters.spacing_mm) + 16
     found = _Room(room)
     answer = call("glance", now, eyes, views, found.record)
-    if answer in (_BEYOND, _CLIPPED):
+    if answer == _CLIPPED:
         return None
     if answer in _LOST:
         raise NeedleNotFound("glance", _LOST[answer])

@@ -1,16 +1,18 @@
 """From masks of thin structures to ordered lines, followed through crossings and short gaps by their direction."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 
 import cv2
 import numpy as np
 import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict, Field
-from scipy.ndimage import map_coordinates, median_filter, uniform_filter1d
+from scipy.ndimage import median_filter, uniform_filter1d
 from skimage.morphology import skeletonize
 
-from needletrack.geometry.spline import arc_length, tangents
-from needletrack.records import Centerline, Float
+from needletrack.geometry.spline import arc_length, unit
+from needletrack.records import Centerline, Float, Int
 from needletrack.tracking.needle import Positive
 from needletrack.tracking.segment import Mask, Ridges
 
@@ -20,6 +22,8 @@ _END_PX = 10
 # A corner is a turn within so many pixels to either side.
 _CORNER_PX = 6
 _WIDTH_STEP = 0.5
+# Filters along a line reach at most so many pixels.
+_REACH = 4
 # Blur widens a line, and a skeleton's width is coarse: only what is clearly too wide is left out here.
 _WIDTH_ALLOWANCE = 1.5
 
@@ -58,10 +62,8 @@ def trace_centerlines(
 ) -> list[Centerline]:
     """Ordered lines of at most the given width, raw px, longest first; which end is the base is not known here."""
     reach = _WIDTH_ALLOWANCE * max_width_px / ridges.reduction + 1.0
-    pieces: list[_Piece] = []
-    for mask in (ridges.bright, ridges.dark):
-        for points in _skeleton_pieces(mask):
-            pieces.extend(_two_sided(points, ridges, reach, parameters))
+    skeletons = [points for mask in (ridges.bright, ridges.dark) for points in _skeleton_pieces(mask)]
+    pieces = _two_sided(skeletons, ridges, reach, parameters)
     chains = _linked(pieces, parameters.max_gap_mm * px_per_mm / ridges.reduction, parameters.max_turn_deg)
     lines = [_centerline(chain, ridges.reduction) for chain in chains]
     return sorted(lines, key=lambda line: -float(arc_length(line.points_px)[-1]))
@@ -112,46 +114,94 @@ def _walk(pixels: list[int], width: int) -> npt.NDArray[np.int64]:
     return np.array(path)
 
 
-def _two_sided(points: Float, ridges: Ridges, max_width: float, parameters: CenterlineParameters) -> list[_Piece]:
-    """The stretches of a piece that differ from both sides: an edge of something wide differs from one only.
+def _two_sided(pieces: list[Float], ridges: Ridges, max_width: float, parameters: CenterlineParameters) -> list[_Piece]:
+    """The stretches of all pieces that differ from both sides: an edge of something wide differs from one only.
 
     They end at corners too, where a skeleton goes over from the needle to the edge of its sleeve.
     """
-    smooth = uniform_filter1d(points, 5, axis=0, mode="nearest")
-    along = tangents(smooth)
-    normal = np.column_stack([-along[:, 1], along[:, 0]])
+    if not pieces:
+        return []
+    ends = np.cumsum([len(points) for points in pieces])
+    runs = _Runs(ends - [len(points) for points in pieces], ends)
+    smooth = runs.filtered(lambda x: uniform_filter1d(x, 5, axis=0), np.concatenate(pieces))
+    along = unit(smooth[runs.beside(1)] - smooth[runs.beside(-1)])
     distances = np.arange(_WIDTH_STEP, max_width + 2.0, _WIDTH_STEP)
-    across = smooth[None, None] + np.multiply.outer(np.outer((-1, 1), distances), normal)
-    middle = _sample(ridges.reduced, smooth)
-    differences = _sample(ridges.reduced, across.reshape(-1, 2)).reshape(2, len(distances), -1) - middle
-    side_contrast = np.abs(differences).max(axis=1)
-    brighter = np.minimum(*differences.max(axis=1))
-    darker = np.minimum(*(-differences).max(axis=1))
-    contrast = np.maximum(brighter, darker)
-    width = _WIDTH_STEP * (np.abs(differences) < side_contrast[:, None] / 2).argmin(axis=1).sum(axis=0) + _WIDTH_STEP
-    good = (uniform_filter1d(contrast, 5, mode="nearest") > parameters.min_contrast_gray) & (
-        median_filter(width, 9, mode="nearest") <= max_width
+    steps = np.concatenate([-distances[::-1], [0.0], distances])[:, None]
+    levels = _sample(ridges.reduced, smooth[:, 0] - steps * along[:, 1], smooth[:, 1] + steps * along[:, 0])
+    levels -= levels[len(distances)].copy()
+    # (sides, distances, points), from the middle outwards.
+    differences = np.stack([levels[len(distances) - 1 :: -1], levels[len(distances) + 1 :]])
+    most, least = differences.max(axis=1), differences.min(axis=1)
+    side_contrast = np.maximum(most, -least)
+    contrast = np.maximum(np.minimum(*most), np.minimum(*-least))
+    is_within = np.abs(differences, out=differences) < side_contrast[:, None] / 2
+    width = _WIDTH_STEP * is_within.argmin(axis=1).sum(axis=0) + _WIDTH_STEP
+    good = runs.filtered(lambda x: uniform_filter1d(x, 5), contrast) > parameters.min_contrast_gray
+    good &= runs.filtered(lambda x: median_filter(x, 9), width) <= max_width
+    good &= _turn_deg(smooth, runs) < parameters.max_turn_deg
+    # A stretch is a run of good points of one piece.
+    begins, stops = good.copy(), good.copy()
+    begins[1:] &= ~good[:-1]
+    stops[:-1] &= ~good[1:]
+    begins[runs.starts] = good[runs.starts]
+    stops[runs.ends - 1] = good[runs.ends - 1]
+    stretches = zip(np.flatnonzero(begins), np.flatnonzero(stops) + 1, strict=True)
+    return [_Piece(smooth[a:b], width[a:b]) for a, b in stretches if b - a >= _MIN_PIECE_PX]
+
+
+@dataclass(frozen=True, eq=False)
+class _Runs:
+    """Pieces one behind the other in one array, each from a start to before an end: (P,) indices."""
+
+    starts: Int
+    ends: Int
+
+    @cached_property
+    def lengths(self) -> Int:
+        """Of each piece (P,)."""
+        return self.ends - self.starts
+
+    def beside(self, step: int) -> Int:
+        """The point (N,) so many further along the piece; the piece's last or first one, where it ends before."""
+        at = np.arange(self.ends[-1]) + step
+        if step < 0:
+            return np.maximum(at, np.repeat(self.starts, self.lengths))
+        return np.minimum(at, np.repeat(self.ends - 1, self.lengths))
+
+    def filtered(self, along: Callable[[Float], Float], values: Float) -> Float:
+        """What a filter along the first axis, of a reach of at most _REACH, makes of each piece, its ends repeated."""
+        return along(values[self._padded])[self._inner]
+
+    @cached_property
+    def _padded(self) -> Int:
+        first = self.starts - np.arange(len(self.starts)) * 2 * _REACH
+        at = np.arange(self.ends[-1] + 2 * _REACH * len(self.starts)) - _REACH
+        longer = self.lengths + 2 * _REACH
+        shift = np.repeat(first - self.starts, longer)
+        return np.clip(at + shift, np.repeat(self.starts, longer), np.repeat(self.ends - 1, longer))
+
+    @cached_property
+    def _inner(self) -> Int:
+        return np.arange(self.ends[-1]) + np.repeat((2 * np.arange(len(self.starts)) + 1) * _REACH, self.lengths)
+
+
+def _turn_deg(points: Float, runs: _Runs) -> Float:
+    """By how much (N,) lines turn about each of their points (N, 2); 0 near their ends."""
+    before = points - points[runs.beside(-_CORNER_PX)]
+    after = points[runs.beside(_CORNER_PX)] - points
+    cross = before[:, 0] * after[:, 1] - before[:, 1] * after[:, 0]
+    turn = np.degrees(np.abs(np.arctan2(cross, (before * after).sum(axis=1))))
+    at = np.arange(len(points))
+    inner = at - np.repeat(runs.starts, runs.lengths) >= _CORNER_PX
+    inner &= np.repeat(runs.ends, runs.lengths) - at > _CORNER_PX
+    return np.where(inner, turn, 0.0)
+
+
+def _sample(image: npt.NDArray[np.float32], x: Float, y: Float) -> npt.NDArray[np.float32]:
+    return np.asarray(
+        cv2.remap(image, x.astype(np.float32), y.astype(np.float32), cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE),
+        dtype=np.float32,
     )
-    good &= _turn_deg(smooth) < parameters.max_turn_deg
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], good.astype(np.int8), [0]])))
-    return [
-        _Piece(smooth[a:b], width[a:b]) for a, b in zip(edges[::2], edges[1::2], strict=True) if b - a >= _MIN_PIECE_PX
-    ]
-
-
-def _turn_deg(points: Float) -> Float:
-    """By how much (N,) a line turns about each of its points (N, 2); 0 near its ends."""
-    turn = np.zeros(len(points))
-    if len(points) > 2 * _CORNER_PX:
-        chord = points[_CORNER_PX:] - points[:-_CORNER_PX]
-        before, after = chord[:-_CORNER_PX], chord[_CORNER_PX:]
-        cross = before[:, 0] * after[:, 1] - before[:, 1] * after[:, 0]
-        turn[_CORNER_PX:-_CORNER_PX] = np.degrees(np.abs(np.arctan2(cross, (before * after).sum(axis=1))))
-    return turn
-
-
-def _sample(image: npt.NDArray[np.float32], points: Float) -> Float:
-    return np.asarray(map_coordinates(image, points[:, ::-1].T, order=1, mode="nearest"), dtype=np.float64)
 
 
 def _linked(pieces: list[_Piece], max_gap: float, max_turn_deg: float) -> list[list[_Piece]]:

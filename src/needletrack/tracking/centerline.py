@@ -3,15 +3,16 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import pairwise
 
 import cv2
 import numpy as np
 import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict, Field
 from scipy.ndimage import median_filter, uniform_filter1d
-from skimage.morphology import skeletonize
 
 from needletrack.geometry.spline import arc_length, unit
+from needletrack.kernels import call
 from needletrack.records import Centerline, Float, Int
 from needletrack.tracking.needle import Positive
 from needletrack.tracking.segment import Mask, Ridges
@@ -70,48 +71,22 @@ def trace_centerlines(
 
 
 def _skeleton_pieces(mask: Mask) -> list[Float]:
-    left, top, width, height = cv2.boundingRect(mask.astype(np.uint8))
-    if width == 0:
-        return []
-    # A rim of background, for the neighbours; what is outside the bounding box costs time and holds nothing.
-    skeleton = np.pad(skeletonize(mask[top : top + height, left : left + width]), 1)
-    neighbours = cv2.filter2D(skeleton.astype(np.uint8), -1, np.ones((3, 3)), borderType=cv2.BORDER_CONSTANT) - 1
-    branching = cv2.dilate((skeleton & (neighbours > 2)).astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
-    open_skeleton = (skeleton & ~branching).astype(np.uint8)
-    count, labels, stats, _ = cv2.connectedComponentsWithStats(open_skeleton, connectivity=8)
-    degree = cv2.filter2D(open_skeleton, -1, np.ones((3, 3)), borderType=cv2.BORDER_CONSTANT)
-    rows, columns = np.nonzero(open_skeleton)
-    # Sorted by piece, and an end of each piece before its other pixels.
-    order = np.lexsort((degree[rows, columns], labels[rows, columns]))
-    flat = (rows * open_skeleton.shape[1] + columns)[order]
-    starts = np.concatenate([[0], np.cumsum(stats[1:, cv2.CC_STAT_AREA])])
-    pieces = []
-    for i in range(count - 1):
-        if starts[i + 1] - starts[i] >= _MIN_PIECE_PX:
-            path = _walk(flat[starts[i] : starts[i + 1]].tolist(), open_skeleton.shape[1])
-            row, column = np.divmod(path, open_skeleton.shape[1])
-            pieces.append(np.column_stack([column + left - 1.0, row + top - 1.0]))
-    return pieces
-
-
-def _walk(pixels: list[int], width: int) -> npt.NDArray[np.int64]:
-    """The pixels of one unbranched stretch, as flat indices into an image of that width, in order from the first."""
-    # Straight steps before diagonal ones, so that a corner of the staircase is not jumped.
-    steps = (1, -1, width, -width, width + 1, width - 1, 1 - width, -1 - width)
-    left = set(pixels)
-    at = pixels[0]
-    path = [at]
-    left.remove(at)
-    while left:
-        for step in steps:
-            if at + step in left:
-                at += step
-                left.remove(at)
-                path.append(at)
-                break
-        else:
-            break
-    return np.array(path)
+    """The unbranched stretches (N, 2) of a mask's skeleton, reduced pixels in order along each."""
+    rows, columns = mask.shape
+    # What is scratch here is as large as the mask, of which a few percent are touched.
+    points, ends = np.empty((mask.size, 2)), np.empty(mask.size, np.int64)
+    count = call(
+        "skeleton_pieces",
+        np.ascontiguousarray(mask),
+        rows,
+        columns,
+        _MIN_PIECE_PX,
+        np.empty((rows + 2, columns + 2), np.uint8),
+        np.empty((2, mask.size), np.int32),
+        points,
+        ends,
+    )
+    return [points[a:b].copy() for a, b in pairwise([0, *ends[:count].tolist()])]
 
 
 def _two_sided(pieces: list[Float], ridges: Ridges, max_width: float, parameters: CenterlineParameters) -> list[_Piece]:

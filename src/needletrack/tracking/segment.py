@@ -14,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict, Field
 
+from needletrack.kernels import call
 from needletrack.records import Image
 from needletrack.tracking.needle import Positive
 
@@ -21,8 +22,8 @@ Mask = npt.NDArray[np.bool_]
 Gray = npt.NDArray[np.float32]
 # Reduced images keep the thinnest needle about this wide, px: thinner ones drown in noise, wider ones only cost time.
 _REDUCED_WIDTH_PX = 0.9
-# The side lobes of a line, in sigmas of the filter.
-_LOBE_REACH = 2.5
+# The side lobes of a line reach so many sigmas of the filter; a line is more than this share of another beside it.
+_LOBE_REACH, _LOBE_SHARE = 2.5, 0.6
 
 
 # Lines cover a few percent of an image; noise makes about a third of its pixels respond.
@@ -59,9 +60,7 @@ class Ridges:
 def find_ridges(image: Image, width_range_px: tuple[float, float], parameters: SegmentParameters) -> Ridges:
     """Masks of the thin bright and thin dark structures of an image (rows, columns) of the given widths, raw px."""
     reduction = max(1, round(width_range_px[0] / _REDUCED_WIDTH_PX))
-    size = (image.shape[1] // reduction, image.shape[0] // reduction)
-    trimmed = image[: size[1] * reduction, : size[0] * reduction]
-    reduced = cv2.resize(trimmed, size, interpolation=cv2.INTER_AREA).astype(np.float32)
+    reduced = _reduced(np.ascontiguousarray(image), reduction)
     widths = np.array(width_range_px) / reduction
     bright, dark = _line_responses(reduced, (max(1.0, widths[0] / 2), max(2.0, widths[1] / 2)))
     return Ridges(_hysteresis(bright, parameters), _hysteresis(dark, parameters), reduced, reduction)
@@ -70,7 +69,7 @@ def find_ridges(image: Image, width_range_px: tuple[float, float], parameters: S
 class _Scratch(threading.local):
     """Arrays for what is computed on the way, kept from call to call: fresh ones cost more than what fills them.
 
-    Handed back to the system and fetched again page by page they take three quarters of a search's time here.
+    Handed back to the system and fetched again page by page they took three quarters of this stage's time.
     """
 
     def __init__(self) -> None:
@@ -80,66 +79,46 @@ class _Scratch(threading.local):
         """The arrays for images of a shape (rows, columns)."""
         if self.shape != shape:
             self.shape = shape
-            self.grays = [np.empty(shape, np.float32) for _ in range(6)]
+            self.grays = [np.empty(shape, np.float32) for _ in range(4)]
             self.responses = np.empty(shape, np.float32), np.empty(shape, np.float32)
-            self.masks = [np.empty(shape, np.bool_) for _ in range(2)]
-            self.labels = np.empty(shape, np.int32)
+            self.pixels = np.empty(shape, np.int32)
         return self
 
 
 _scratch = _Scratch()
 
 
+def _reduced(image: Image, reduction: int) -> Gray:
+    """The means (rows, columns) of whole squares of pixels, in whole grey levels."""
+    rows, columns = image.shape[0] // reduction, image.shape[1] // reduction
+    reduced = np.empty((rows, columns), np.float32)
+    sums = np.empty(columns * reduction, np.uint16)
+    call("reduce", image, image.shape[1], reduction, rows, columns, sums, reduced)
+    return reduced
+
+
 def _line_responses(image: Gray, sigmas_px: tuple[float, ...]) -> tuple[Gray, Gray]:
-    bright, dark = _scratch.of(image.shape).responses
+    scratch = _scratch.of(image.shape)
+    bright, dark = scratch.responses
     bright.fill(0)
     dark.fill(0)
     for sigma in sigmas_px:
-        _add_lines(image, sigma, bright, dark)
+        blurred, bright_lines, dark_lines, nearby = scratch.grays
+        cv2.GaussianBlur(image, (0, 0), sigma, dst=blurred, borderType=cv2.BORDER_REPLICATE)
+        call("line_answers", blurred, *image.shape, float(sigma**2), bright_lines, dark_lines)
+        # Beside a line of one polarity the second derivative has lobes of the other, 0.45 of its height (Gaussian
+        # profile), as far as the filter reaches: what is further away, such as a vessel beside a faint needle, has none
+        # here.
+        size = 2 * math.ceil(_LOBE_REACH * sigma) + 1
+        reach = np.ones((size, size), np.uint8)
+        cv2.dilate(dark_lines, reach, dst=nearby)
+        call("add_lines", bright_lines, nearby, _LOBE_SHARE, image.size, bright)
+        cv2.dilate(bright_lines, reach, dst=nearby)
+        call("add_lines", dark_lines, nearby, _LOBE_SHARE, image.size, dark)
     for response in (bright, dark):
         response[[0, -1]] = 0
         response[:, [0, -1]] = 0
     return bright, dark
-
-
-def _add_lines(image: Gray, sigma: float, bright: Gray, dark: Gray) -> None:
-    """Raise the responses to bright and to dark lines to what they are at this scale."""
-    scratch = _scratch.of(image.shape)
-    a, b, c, d, e, f = scratch.grays
-    is_line, is_it = scratch.masks
-    border = cv2.BORDER_REPLICATE
-    blurred = cv2.GaussianBlur(image, (0, 0), sigma, dst=a, borderType=border)
-    xx = cv2.Sobel(blurred, cv2.CV_32F, 2, 0, dst=b, ksize=1, scale=sigma**2, borderType=border)
-    yy = cv2.Sobel(blurred, cv2.CV_32F, 0, 2, dst=c, ksize=1, scale=sigma**2, borderType=border)
-    xy = cv2.Sobel(blurred, cv2.CV_32F, 1, 1, dst=d, ksize=3, scale=0.25 * sigma**2, borderType=border)
-    # The eigenvalues of the Hessian are mean -+ spread. A line curves across and hardly along: the stronger one is
-    # more than twice the other, which is |mean| between a third of the spread and three times it.
-    mean = cv2.addWeighted(xx, 0.5, yy, 0.5, 0.0, dst=a)
-    difference = cv2.addWeighted(xx, 0.5, yy, -0.5, 0.0, dst=e)
-    spread = cv2.magnitude(difference, xy, magnitude=b)
-    size = np.abs(mean, out=c)
-    strength = np.add(size, spread, out=d)
-    np.greater(np.multiply(size, 3, out=e), spread, out=is_line)
-    is_line &= np.less(size, np.multiply(spread, 3, out=e), out=is_it)
-    # Products with masks: selecting (np.where) where masks are as ragged as noise takes ten times as long.
-    np.less(mean, 0, out=is_it)
-    is_it &= is_line
-    np.multiply(strength, is_it, out=e)
-    np.greater(mean, 0, out=is_it)
-    is_it &= is_line
-    np.multiply(strength, is_it, out=f)
-    _add_without_side_lobes(e, f, sigma, bright, scratch)
-    _add_without_side_lobes(f, e, sigma, dark, scratch)
-
-
-def _add_without_side_lobes(lines: Gray, others: Gray, sigma: float, response: Gray, scratch: _Scratch) -> None:
-    # Beside a line of one polarity the second derivative has lobes of the other, 0.45 of its height (Gaussian profile),
-    # as far as the filter reaches: what is further away, such as a vessel beside a faint needle, has none here.
-    size = 2 * math.ceil(_LOBE_REACH * sigma) + 1
-    high = cv2.dilate(others, np.ones((size, size), np.uint8), dst=scratch.grays[0])
-    high *= np.float32(0.6)
-    is_it = np.greater(lines, high, out=scratch.masks[0])
-    np.maximum(response, np.multiply(lines, is_it, out=high), out=response)
 
 
 def _hysteresis(response: Gray, parameters: SegmentParameters) -> Mask:
@@ -150,10 +129,6 @@ def _hysteresis(response: Gray, parameters: SegmentParameters) -> Mask:
     noise = float(np.median(positive)) if positive.size > _MIN_NOISE_SHARE * sample.size else 0.0
     high = max(parameters.high_threshold_noise * noise, parameters.min_response_gray)
     low = min(high, max(parameters.low_threshold_noise * noise, parameters.min_response_gray / 2))
-    scratch = _scratch.of(response.shape)
-    candidates = np.greater(response, low, out=scratch.masks[0])
-    count, labels = cv2.connectedComponents(candidates.view(np.uint8), labels=scratch.labels, connectivity=8)
-    keep = np.zeros(count, np.bool_)
-    keep[labels[np.greater(response, high, out=scratch.masks[1])]] = True
-    keep[0] = False
-    return np.take(keep, labels)
+    mask = np.empty(response.shape, np.bool_)
+    call("hysteresis", response, *response.shape, float(low), float(high), _scratch.of(response.shape).pixels, mask)
+    return mask

@@ -1,0 +1,189 @@
+/* Thin structures of an image that was reduced: how strongly each pixel answers, which hang together, their skeletons. */
+#include "kernels.h"
+
+/* The image reduced k times: rows x columns means of k x k pixels, rounded to whole grey levels. */
+EXPORT void reduce(const uint8_t *image, int64_t stride, int64_t k, int64_t rows, int64_t columns, uint16_t *sums,
+                   float *reduced) {
+  int64_t width = columns * k;
+  float share = 1.0f / (float)(k * k);
+  for (int64_t r = 0; r < rows; r++) {
+    const uint8_t *row = image + r * k * stride;
+    for (int64_t x = 0; x < width; x++) sums[x] = row[x];
+    for (int64_t i = 1; i < k; i++) {
+      row += stride;
+      for (int64_t x = 0; x < width; x++) sums[x] = (uint16_t)(sums[x] + row[x]);
+    }
+    for (int64_t c = 0; c < columns; c++) {
+      uint32_t sum = 0;
+      for (int64_t i = 0; i < k; i++) sum += sums[c * k + i];
+      reduced[r * columns + c] = floorf((float)sum * share + 0.5f);
+    }
+  }
+}
+
+static inline void answer(float left, float here, float right, float up, float down, float corners, float scale,
+                          float *bright, float *dark) {
+  float xx = scale * (left - 2 * here + right), yy = scale * (up - 2 * here + down), xy = 0.25f * scale * corners;
+  /* The eigenvalues of the Hessian are mean -+ spread. A line curves across and hardly along: the stronger one is more
+     than twice the other, which is |mean| between a third of the spread and three times it. */
+  float mean = 0.5f * (xx + yy), difference = 0.5f * (xx - yy);
+  float spread = sqrtf(difference * difference + xy * xy), size = fabsf(mean);
+  float strength = (3 * size > spread) & (size < 3 * spread) ? size + spread : 0.0f;
+  *bright = mean < 0 ? strength : 0.0f;
+  *dark = mean > 0 ? strength : 0.0f;
+}
+
+/* How strongly each pixel of an image blurred by sigma answers to bright and to dark lines; scale: sigma squared. */
+EXPORT void line_answers(const float *blurred, int64_t rows, int64_t columns, double squared, float *bright,
+                         float *dark) {
+  float scale = (float)squared;
+  for (int64_t r = 0; r < rows; r++) {
+    const float *here = blurred + r * columns;
+    const float *up = r > 0 ? here - columns : here, *down = r + 1 < rows ? here + columns : here;
+    float *b = bright + r * columns, *d = dark + r * columns;
+    for (int64_t c = 1; c < columns - 1; c++)
+      answer(here[c - 1], here[c], here[c + 1], up[c], down[c], up[c - 1] - up[c + 1] - down[c - 1] + down[c + 1],
+             scale, b + c, d + c);
+    for (int64_t c = 0; c < columns; c += columns > 1 ? columns - 1 : 1) {
+      int64_t before = c > 0 ? c - 1 : 0, after = c + 1 < columns ? c + 1 : c;
+      answer(here[before], here[c], here[after], up[c], down[c], up[before] - up[after] - down[before] + down[after],
+             scale, b + c, d + c);
+    }
+  }
+}
+
+/* Raise a response (n,) to the lines of this scale that exceed a share of the other polarity's nearby, the most of it. */
+EXPORT void add_lines(const float *lines, const float *others, double share, int64_t n, float *response) {
+  float least = (float)share;
+  for (int64_t i = 0; i < n; i++) {
+    float line = lines[i] > least * others[i] ? lines[i] : 0.0f;
+    response[i] = response[i] > line ? response[i] : line;
+  }
+}
+
+/* What exceeds low and hangs together, by eight neighbours, with something above high; the outermost pixels hold 0. */
+EXPORT void hysteresis(const float *response, int64_t rows, int64_t columns, double low, double high, int32_t *stack,
+                       uint8_t *mask) {
+  const int64_t beside[8] = {-columns - 1, -columns, 1 - columns, -1, 1, columns - 1, columns, columns + 1};
+  float least = (float)low, start = (float)high;
+  memset(mask, 0, (size_t)(rows * columns));
+  for (int64_t i = 0; i < rows * columns; i++) {
+    if (!(response[i] > start) || mask[i]) continue;
+    int64_t depth = 0;
+    mask[i] = 1;
+    stack[depth++] = (int32_t)i;
+    while (depth) {
+      int64_t at = stack[--depth];
+      for (int k = 0; k < 8; k++) {
+        int64_t next = at + beside[k];
+        if (!mask[next] && response[next] > least) mask[next] = 1, stack[depth++] = (int32_t)next;
+      }
+    }
+  }
+}
+
+/* In which passes thinning takes away a pixel with these neighbours, clockwise from above: first (1), second (2), both.
+   Zhang & Suen 1984, but for two things. Lines two pixels wide would wear away from their ends and corners: what holds
+   on by few pixels goes in one pass alone. And corners of a staircase go, the upper ones first, so that no pixel of an
+   unbranched line has more than two neighbours. */
+static uint8_t passes(unsigned n) {
+  int p[8], runs = 0, count = 0;
+  for (int k = 0; k < 8; k++) p[k] = n >> k & 1;
+  for (int k = 0; k < 8; k++) runs += !p[k] && p[(k + 1) % 8], count += p[k];
+  if (count < 2 || count > 6) return 0;
+  int up = p[0], right = p[2], down = p[4], left = p[6];
+  if (runs == 2) {
+    for (int k = 0; k < 8; k += 2)
+      /* Two sides meet at a pixel that is not set; opposite there is nothing. */
+      if (p[k] && p[(k + 2) % 8] && !p[(k + 1) % 8] && !p[(k + 4) % 8] && !p[(k + 5) % 8] && !p[(k + 6) % 8])
+        return count == 2 ? 3 : up ? 1 : 2;
+    return 0;
+  }
+  if (runs != 1) return 0;
+  if (count == 2 || (count == 3 && up + right + down + left == 2)) return up || (right && p[1]) || (left && p[7]) ? 1 : 2;
+  int first = !(up && right && down) && !(right && down && left), second = !(up && right && left) && !(up && down && left);
+  return (uint8_t)(first | second << 1);
+}
+
+static inline unsigned neighbours(const uint8_t *on, int64_t w) {
+  return (unsigned)(on[-w] | on[1 - w] << 1 | on[1] << 2 | on[w + 1] << 3 | on[w] << 4 | on[w - 1] << 5 | on[-1] << 6 |
+                    on[-w - 1] << 7);
+}
+
+/* Unbranched stretches of a mask's skeleton, in order from one end: pixels (x, y) one stretch behind the other, and how
+   many stretches; ends: where each stops. on (rows + 2, columns + 2), list (2, rows * columns) are for its own use. */
+EXPORT int32_t skeleton_pieces(const uint8_t *mask, int64_t rows, int64_t columns, int64_t shortest, uint8_t *on,
+                               int32_t *list, double *points, int64_t *ends) {
+  int64_t w = columns + 2, count = 0;
+  int32_t *other = list + rows * columns;
+  memset(on, 0, (size_t)((rows + 2) * w));
+  for (int64_t r = 0; r < rows; r++)
+    for (int64_t c = 0; c < columns; c++)
+      if (mask[r * columns + c]) {
+        int64_t at = (r + 1) * w + c + 1;
+        on[at] = 1;
+        list[count++] = (int32_t)at;
+      }
+  uint8_t table[256];
+  for (unsigned n = 0; n < 256; n++) table[n] = passes(n);
+  for (int64_t quiet = 0, pass = 1; quiet < 2; pass = 3 - pass) {
+    int64_t gone = 0, kept = 0;
+    for (int64_t i = 0; i < count; i++) {
+      int32_t at = list[i];
+      if (table[neighbours(on + at, w)] & pass)
+        other[gone++] = at;
+      else
+        list[kept++] = at;
+    }
+    for (int64_t i = 0; i < gone; i++) on[other[i]] = 0;
+    count = kept;
+    quiet = gone ? 0 : quiet + 1;
+  }
+  /* Without the pixels at which lines meet, and those beside them, no pixel has more than two neighbours. */
+  int64_t open = 0;
+  for (int64_t i = 0; i < count; i++)
+    other[i] = __builtin_popcount(neighbours(on + list[i], w)) > 2;
+  for (int64_t i = 0; i < count; i++)
+    if (other[i])
+      for (int64_t dy = -w; dy <= w; dy += w)
+        for (int64_t dx = -1; dx <= 1; dx++) on[list[i] + dy + dx] = 0;
+  for (int64_t i = 0; i < count; i++)
+    if (on[list[i]]) list[open++] = list[i];
+  /* Straight steps before diagonal ones, so that a corner of the staircase is not jumped. */
+  const int64_t steps[8] = {1, -1, w, -w, w + 1, w - 1, 1 - w, -1 - w};
+  int64_t pieces = 0, length = 0;
+  for (int64_t i = 0; i < open; i++) {
+    if (on[list[i]] != 1) continue;
+    /* All of the stretch, and the first of its pixels with the fewest neighbours: an end, if it has one. */
+    int64_t found = 0;
+    other[found++] = list[i];
+    on[list[i]] = 2;
+    int32_t start = 0;
+    int fewest = 9;
+    for (int64_t j = 0; j < found; j++) {
+      int beside = 0;
+      for (int k = 0; k < 8; k++) {
+        int32_t next = other[j] + (int32_t)steps[k];
+        if (!on[next]) continue;
+        beside++;
+        if (on[next] == 1) on[next] = 2, other[found++] = next;
+      }
+      if (beside < fewest || (beside == fewest && other[j] < start)) fewest = beside, start = other[j];
+    }
+    if (found < shortest) continue;
+    for (int64_t at = start, goes_on = 1; goes_on;) {
+      on[at] = 3;
+      points[2 * length] = (double)(at % w - 1), points[2 * length + 1] = (double)(at / w - 1);
+      length++;
+      goes_on = 0;
+      for (int k = 0; k < 8; k++)
+        if (on[at + steps[k]] == 2) {
+          at += steps[k];
+          goes_on = 1;
+          break;
+        }
+    }
+    ends[pieces++] = length;
+  }
+  return (int32_t)pieces;
+}

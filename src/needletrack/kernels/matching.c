@@ -42,6 +42,9 @@ static int is_inside(const double *box, const double *point) {
   return 1;
 }
 
+/* As a share of the step from one point of a line to the next. */
+#define ENDS_MEET 1e-6
+
 /* Where the epipolar lines of left points cross right lines, for each pair of lines: pairs (count, 4) are the first and
    behind the last point of the left and of the right line. Found, in the box (lowest corner, highest corner), are: the
    left point, counted from the line's first, how far along the right line, in its points, where in both views, in
@@ -64,9 +67,12 @@ EXPORT int32_t crossings(const Rig *rig, const double *left_px, const double *ri
       int has_ray = 0;
       for (int64_t j = 0; j + 1 < n; j++) {
         double near = distance[j], far = distance[j + 1];
-        if ((near < 0) == (far < 0)) continue;
+        double share = near / (near - far);
+        /* Ends of lines that are each other's partners meet, whatever rounding says. */
+        if ((near < 0) == (far < 0) && !(j == 0 && fabs(share) < ENDS_MEET) && !(j + 2 == n && fabs(share - 1) < ENDS_MEET))
+          continue;
         if (!has_ray) unit_ray(rig->ray_of_left, at, left_ray), has_ray = 1;
-        double share = near / (near - far), dx = right[2 * j + 2] - right[2 * j], dy = right[2 * j + 3] - right[2 * j + 1];
+        double dx = right[2 * j + 2] - right[2 * j], dy = right[2 * j + 3] - right[2 * j + 1];
         double px[2] = {right[2 * j] + share * dx, right[2 * j + 1] + share * dy}, right_ray[3], point[3];
         unit_right_ray(rig, px, right_ray);
         if (!midpoint(rig, left_ray, right_ray, point) || !is_inside(box, point)) continue;

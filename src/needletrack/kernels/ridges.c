@@ -187,3 +187,45 @@ EXPORT int32_t skeleton_pieces(const uint8_t *mask, int64_t rows, int64_t column
   }
   return (int32_t)pieces;
 }
+
+static inline float level(const float *image, int64_t rows, int64_t columns, float x, float y) {
+  x = x < 0 ? 0 : x > (float)(columns - 1) ? (float)(columns - 1) : x;
+  y = y < 0 ? 0 : y > (float)(rows - 1) ? (float)(rows - 1) : y;
+  int32_t c = (int32_t)x, r = (int32_t)y;
+  float fx = x - (float)c, fy = y - (float)r;
+  const float *at = image + r * columns + c, *below = r + 1 < rows ? at + columns : at;
+  int32_t next = c + 1 < columns;
+  float above = at[0] + fx * (at[next] - at[0]);
+  return above + fy * (below[0] + fx * (below[next] - below[0]) - above);
+}
+
+/* By how much each point (n, 2) of lines differs from both its sides within `count` steps of so many pixels across their
+   direction (n, 2), and how wide it is: up to where either side differs half as much as it ever does. */
+EXPORT void two_sided(const float *image, int64_t rows, int64_t columns, const double *points, const double *along,
+                      int64_t n, double step, int64_t count, double *contrast, double *width) {
+  float difference[count];
+  for (int64_t i = 0; i < n; i++) {
+    float x = (float)points[2 * i], y = (float)points[2 * i + 1];
+    float here = level(image, rows, columns, x, y), brightest[2], darkest[2];
+    int64_t within = 0;
+    for (int side = 0; side < 2; side++) {
+      float dx = (float)((side ? -step : step) * along[2 * i + 1]), dy = (float)((side ? step : -step) * along[2 * i]);
+      float most = -INFINITY, least = INFINITY;
+      for (int64_t k = 0; k < count; k++) {
+        float d = level(image, rows, columns, x + (float)(k + 1) * dx, y + (float)(k + 1) * dy) - here;
+        most = d > most ? d : most;
+        least = d < least ? d : least;
+        difference[k] = fabsf(d);
+      }
+      brightest[side] = most, darkest[side] = -least;
+      float half = (most > -least ? most : -least) / 2;
+      int64_t k = 0;
+      while (k < count && difference[k] < half) k++;
+      within += k < count ? k : 0;
+    }
+    float bright = brightest[0] < brightest[1] ? brightest[0] : brightest[1];
+    float dark = darkest[0] < darkest[1] ? darkest[0] : darkest[1];
+    contrast[i] = bright > dark ? bright : dark;
+    width[i] = step * (double)(within + 1);
+  }
+}

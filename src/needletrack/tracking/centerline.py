@@ -5,9 +5,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
 
-import cv2
 import numpy as np
-import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict, Field
 from scipy.ndimage import median_filter, uniform_filter1d
 
@@ -43,19 +41,36 @@ class CenterlineParameters(BaseModel):
     )
 
 
-@dataclass(frozen=True, slots=True)
-class _Piece:
-    """Reduced pixels (N, 2) in order along one unbranched stretch of skeleton, and the width (N,) seen there."""
+@dataclass(frozen=True, eq=False)
+class _Pieces:
+    """Unbranched stretches of skeleton: reduced pixels (N, 2) in order along each, width (N,) seen there.
+
+    One behind the other, each from a start to before a stop, (P,).
+    """
 
     points: Float
     width: Float
+    starts: Int
+    stops: Int
 
-    def end(self, which: int) -> tuple[Float, Float]:
-        """Position and outward unit direction of the first (0) or the last (1) end."""
-        stretch = self.points[:_END_PX][::-1] if which == 0 else self.points[-_END_PX:]
-        centered = stretch - stretch.mean(axis=0)
-        axis = np.linalg.svd(centered, full_matrices=False)[2][0]
-        return stretch[-1], axis if axis @ (stretch[-1] - stretch[0]) >= 0 else -axis
+    def ends(self) -> tuple[Float, Float]:
+        """Position and outward unit direction (2 P, 2) of the first and the last end of each."""
+        first = np.repeat(self.starts, 2)
+        last = np.repeat(self.stops, 2) - 1
+        at = np.stack([self.starts, self.stops - 1], axis=1).ravel()
+        inwards = np.tile([1, -1], len(self.starts))
+        index = at[:, None] + inwards[:, None] * np.arange(_END_PX)
+        valid = (index >= first[:, None]) & (index <= last[:, None])
+        stretch = self.points[np.clip(index, first[:, None], last[:, None])]
+        count = valid.sum(axis=1)
+        centered = stretch - ((stretch * valid[..., None]).sum(axis=1) / count[:, None])[:, None]
+        x, y = centered[..., 0] * valid, centered[..., 1] * valid
+        # The longer axis of the points' moments.
+        angle = np.arctan2(2 * (x * y).sum(axis=1), (x * x).sum(axis=1) - (y * y).sum(axis=1)) / 2
+        axis = np.column_stack([np.cos(angle), np.sin(angle)])
+        position = self.points[at]
+        outward = position - stretch[np.arange(len(at)), count - 1]
+        return position, np.where((axis * outward).sum(axis=1, keepdims=True) >= 0, axis, -axis)
 
 
 def trace_centerlines(
@@ -66,8 +81,7 @@ def trace_centerlines(
     skeletons = [points for mask in (ridges.bright, ridges.dark) for points in _skeleton_pieces(mask)]
     pieces = _two_sided(skeletons, ridges, reach, parameters)
     chains = _linked(pieces, parameters.max_gap_mm * px_per_mm / ridges.reduction, parameters.max_turn_deg)
-    lines = [_centerline(chain, ridges.reduction) for chain in chains]
-    return sorted(lines, key=lambda line: -float(arc_length(line.points_px)[-1]))
+    return _centerlines(pieces, chains, ridges.reduction)
 
 
 def _skeleton_pieces(mask: Mask) -> list[Float]:
@@ -89,28 +103,22 @@ def _skeleton_pieces(mask: Mask) -> list[Float]:
     return [points[a:b].copy() for a, b in pairwise([0, *ends[:count].tolist()])]
 
 
-def _two_sided(pieces: list[Float], ridges: Ridges, max_width: float, parameters: CenterlineParameters) -> list[_Piece]:
+def _two_sided(pieces: list[Float], ridges: Ridges, max_width: float, parameters: CenterlineParameters) -> _Pieces:
     """The stretches of all pieces that differ from both sides: an edge of something wide differs from one only.
 
     They end at corners too, where a skeleton goes over from the needle to the edge of its sleeve.
     """
     if not pieces:
-        return []
+        nothing = np.zeros(0, np.int64)
+        return _Pieces(np.zeros((0, 2)), np.zeros(0), nothing, nothing)
     ends = np.cumsum([len(points) for points in pieces])
     runs = _Runs(ends - [len(points) for points in pieces], ends)
     smooth = runs.filtered(lambda x: uniform_filter1d(x, 5, axis=0), np.concatenate(pieces))
     along = unit(smooth[runs.beside(1)] - smooth[runs.beside(-1)])
-    distances = np.arange(_WIDTH_STEP, max_width + 2.0, _WIDTH_STEP)
-    steps = np.concatenate([-distances[::-1], [0.0], distances])[:, None]
-    levels = _sample(ridges.reduced, smooth[:, 0] - steps * along[:, 1], smooth[:, 1] + steps * along[:, 0])
-    levels -= levels[len(distances)].copy()
-    # (sides, distances, points), from the middle outwards.
-    differences = np.stack([levels[len(distances) - 1 :: -1], levels[len(distances) + 1 :]])
-    most, least = differences.max(axis=1), differences.min(axis=1)
-    side_contrast = np.maximum(most, -least)
-    contrast = np.maximum(np.minimum(*most), np.minimum(*-least))
-    is_within = np.abs(differences, out=differences) < side_contrast[:, None] / 2
-    width = _WIDTH_STEP * is_within.argmin(axis=1).sum(axis=0) + _WIDTH_STEP
+    contrast, width = np.empty(len(smooth)), np.empty(len(smooth))
+    image = ridges.reduced
+    steps = len(np.arange(_WIDTH_STEP, max_width + 2.0, _WIDTH_STEP))
+    call("two_sided", image, *image.shape, smooth, along, len(smooth), _WIDTH_STEP, steps, contrast, width)
     good = runs.filtered(lambda x: uniform_filter1d(x, 5), contrast) > parameters.min_contrast_gray
     good &= runs.filtered(lambda x: median_filter(x, 9), width) <= max_width
     good &= _turn_deg(smooth, runs) < parameters.max_turn_deg
@@ -120,8 +128,9 @@ def _two_sided(pieces: list[Float], ridges: Ridges, max_width: float, parameters
     stops[:-1] &= ~good[1:]
     begins[runs.starts] = good[runs.starts]
     stops[runs.ends - 1] = good[runs.ends - 1]
-    stretches = zip(np.flatnonzero(begins), np.flatnonzero(stops) + 1, strict=True)
-    return [_Piece(smooth[a:b], width[a:b]) for a, b in stretches if b - a >= _MIN_PIECE_PX]
+    starts, behind = np.flatnonzero(begins), np.flatnonzero(stops) + 1
+    long_enough = behind - starts >= _MIN_PIECE_PX
+    return _Pieces(smooth, width, starts[long_enough], behind[long_enough])
 
 
 @dataclass(frozen=True, eq=False)
@@ -172,70 +181,78 @@ def _turn_deg(points: Float, runs: _Runs) -> Float:
     return np.where(inner, turn, 0.0)
 
 
-def _sample(image: npt.NDArray[np.float32], x: Float, y: Float) -> npt.NDArray[np.float32]:
-    return np.asarray(
-        cv2.remap(image, x.astype(np.float32), y.astype(np.float32), cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE),
-        dtype=np.float32,
-    )
+_Chain = list[tuple[int, bool]]
 
 
-def _linked(pieces: list[_Piece], max_gap: float, max_turn_deg: float) -> list[list[_Piece]]:
-    """Chains of pieces: every end joins at most one other, the straightest and nearest continuation first."""
-    if not pieces:
-        return []
-    ends = [(i, which) for i in range(len(pieces)) for which in (0, 1)]
-    located = [pieces[i].end(which) for i, which in ends]
-    position = np.array([p for p, _ in located])
-    outward = np.array([d for _, d in located])
-    owner = np.array([i for i, _ in ends])
+def _linked(pieces: _Pieces, max_gap: float, max_turn_deg: float) -> list[_Chain]:
+    """Chains of pieces, and whether each is taken from its last end.
+
+    Every end joins at most one other, the straightest and nearest continuation first.
+    """
+    position, outward = pieces.ends()
     gap = position[None] - position[:, None]
-    distance = np.linalg.norm(gap, axis=2)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        towards = gap / distance[:, :, None]
+    near = np.triu((gap**2).sum(axis=2) < max_gap**2, 1)
+    a, b = np.nonzero(near)
+    of_two = a // 2 != b // 2
+    a, b = a[of_two], b[of_two]
+    towards = gap[a, b]
+    distance = np.linalg.norm(towards, axis=1)
+    towards /= np.maximum(distance, 1e-9)[:, None]
     # Across a gap of a pixel or two its direction is noise: only the turn between the pieces counts.
     far = distance > 4.0
-    turn = np.degrees(np.arccos(np.clip(-(outward @ outward.T), -1, 1)))
-    leave = np.degrees(np.arccos(np.clip(np.where(far, (outward[:, None] * towards).sum(axis=2), 1.0), -1, 1)))
-    worst = np.maximum(turn, np.maximum(leave, leave.T))
+    cosines = np.stack(
+        [
+            -(outward[a] * outward[b]).sum(axis=1),
+            np.where(far, (outward[a] * towards).sum(axis=1), 1.0),
+            np.where(far, -(outward[b] * towards).sum(axis=1), 1.0),
+        ]
+    )
+    worst = np.degrees(np.arccos(np.clip(cosines.min(axis=0), -1, 1)))
     short = 12.0
     limit = np.where(
         distance < short,
         max_turn_deg,
         max_turn_deg / 3 + 2 * max_turn_deg / 3 * short / np.maximum(distance, short),
     )
-    cost = np.where(
-        (owner[:, None] != owner[None]) & (distance < max_gap) & (worst < limit),
-        distance / short + worst / max_turn_deg,
-        np.inf,
-    )
+    cost = distance / short + worst / max_turn_deg
     joined: dict[int, int] = {}
-    for flat in np.argsort(cost, axis=None, kind="stable"):
-        a, b = divmod(int(flat), len(ends))
-        if not np.isfinite(cost[a, b]):
-            break
-        if a not in joined and b not in joined:
-            joined[a], joined[b] = b, a
-    return _chains(pieces, joined)
+    order = np.argsort(cost, kind="stable")
+    for k in order[(worst < limit)[order]].tolist():
+        one, other = int(a[k]), int(b[k])
+        if one not in joined and other not in joined:
+            joined[one], joined[other] = other, one
+    return _chains(len(pieces.starts), joined)
 
 
-def _chains(pieces: list[_Piece], joined: dict[int, int]) -> list[list[_Piece]]:
+def _chains(count: int, joined: dict[int, int]) -> list[_Chain]:
     done: set[int] = set()
-    chains: list[list[_Piece]] = []
+    chains: list[_Chain] = []
     # Free ends first; what is left after them is closed loops, which are cut anywhere.
-    for start in sorted(range(2 * len(pieces)), key=lambda e: (e in joined, e)):
+    for start in sorted(range(2 * count), key=lambda e: (e in joined, e)):
         entry: int | None = start
-        chain: list[_Piece] = []
+        chain: _Chain = []
         while entry is not None and entry // 2 not in done:
             piece, which = divmod(entry, 2)
             done.add(piece)
-            chain.append(pieces[piece] if which == 0 else _Piece(pieces[piece].points[::-1], pieces[piece].width[::-1]))
+            chain.append((piece, which == 1))
             entry = joined.get(2 * piece + 1 - which)
         if chain:
             chains.append(chain)
     return chains
 
 
-def _centerline(chain: list[_Piece], reduction: int) -> Centerline:
-    points = np.concatenate([piece.points for piece in chain])
-    width = np.concatenate([piece.width for piece in chain])
-    return Centerline((points + 0.5) * reduction - 0.5, width * reduction)
+def _centerlines(pieces: _Pieces, chains: list[_Chain], reduction: int) -> list[Centerline]:
+    """The lines that chains of pieces are, in raw pixels, the longest first."""
+    if not chains:
+        return []
+    cuts = [
+        [np.arange(pieces.starts[piece], pieces.stops[piece])[:: -1 if turned else 1] for piece, turned in chain]
+        for chain in chains
+    ]
+    at = np.concatenate([cut for chain in cuts for cut in chain])
+    stops = np.cumsum([sum(map(len, chain)) for chain in cuts])
+    points, width = (pieces.points[at] + 0.5) * reduction - 0.5, pieces.width[at] * reduction
+    along = arc_length(points)
+    starts = np.concatenate([[0], stops[:-1]])
+    longest = np.argsort(along[starts] - along[stops - 1], kind="stable").tolist()
+    return [Centerline(points[starts[k] : stops[k]], width[starts[k] : stops[k]]) for k in longest]

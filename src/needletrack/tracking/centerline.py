@@ -148,9 +148,7 @@ class _Runs:
     def beside(self, step: int) -> Int:
         """The point (N,) so many further along the piece; the piece's last or first one, where it ends before."""
         at = np.arange(self.ends[-1]) + step
-        if step < 0:
-            return np.maximum(at, np.repeat(self.starts, self.lengths))
-        return np.minimum(at, np.repeat(self.ends - 1, self.lengths))
+        return np.asarray(np.clip(at, np.repeat(self.starts, self.lengths), np.repeat(self.ends - 1, self.lengths)))
 
     def filtered(self, along: Callable[[Float], Float], values: Float) -> Float:
         """What a filter along the first axis, of a reach of at most _REACH, makes of each piece, its ends repeated."""
@@ -162,11 +160,12 @@ class _Runs:
         at = np.arange(self.ends[-1] + 2 * _REACH * len(self.starts)) - _REACH
         longer = self.lengths + 2 * _REACH
         shift = np.repeat(first - self.starts, longer)
-        return np.clip(at + shift, np.repeat(self.starts, longer), np.repeat(self.ends - 1, longer))
+        return np.asarray(np.clip(at + shift, np.repeat(self.starts, longer), np.repeat(self.ends - 1, longer)))
 
     @cached_property
     def _inner(self) -> Int:
-        return np.arange(self.ends[-1]) + np.repeat((2 * np.arange(len(self.starts)) + 1) * _REACH, self.lengths)
+        before = (2 * np.arange(len(self.starts)) + 1) * _REACH
+        return np.asarray(np.arange(self.ends[-1]) + np.repeat(before, self.lengths))
 
 
 def _turn_deg(points: Float, runs: _Runs) -> Float:

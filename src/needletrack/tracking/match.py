@@ -7,10 +7,8 @@ for. A stretch along the epipolar lines has no crossings and goes without a part
 whole are matched by their ends.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import pairwise
 
 import numpy as np
 import numpy.typing as npt
@@ -111,21 +109,18 @@ def match_lines(
     )
     pairs = _pairs(views, parameters)
     least_mm = needle.min_length_mm / 2
-    crossing_mm: dict[tuple[int, int], float] = {}
-    offered: list[_Offer] = []
-    lines = [(i, j) for i, j, _ in pairs.within]
-    chains = _best_chains(_crossings(views, views.left, lines, workspace), views.rig, parameters)
-    for (i, j, own), chain in zip(pairs.within, chains, strict=True):
-        if chain is not None:
-            offer = _Offer(i, j, chain, own)
-            offered.append(offer)
-            if np.median(chain.crossings.sine) > _LENGTHWISE / 2:
-                crossing_mm[i, j] = offer.length_mm
-    for i, j, chain in _lengthwise(views):
-        offer = _Offer(i, j, chain, 1.0)
-        if offer.length_mm > _LENGTHENS * crossing_mm.get((i, j), 0.0):
-            offered.append(offer)
-    offered = [offer for offer in offered if offer.length_mm >= least_mm]
+    shape = len(left), len(right)
+    own, crossing_mm = np.ones(shape), np.zeros(shape)
+    own[tuple(pairs.within.T)] = pairs.own
+    found = _crossings(views, views.left, pairs.within, workspace)
+    chains = _best_chains(found, pairs.within, views.rig, parameters)
+    offered = _offers(chains, own[tuple(chains.lines.T)], chains.lengths_mm >= least_mm)
+    for offer in offered:
+        if np.median(offer.chain.crossings.sine) > _LENGTHWISE / 2:
+            crossing_mm[offer.left, offer.right] = offer.length_mm
+    along = _lengthwise(views)
+    longer = along.lengths_mm > _LENGTHENS * crossing_mm[tuple(along.lines.T)]
+    offered += _offers(along, np.ones(len(along)), longer & (along.lengths_mm >= least_mm))
     if not offered:
         raise NeedleNotFound("match", Reason.OUTSIDE_WORKSPACE if pairs.elsewhere else Reason.NO_STEREO_MATCH)
     best: list[Candidate] = []
@@ -205,9 +200,9 @@ class _Views:
     rig: StereoRig
     workspace: Workspace
 
-    def ranges(self, left: _Lines, pairs: Sequence[tuple[int, int]]) -> Int:
+    def ranges(self, left: _Lines, pairs: Int) -> Int:
         """Where the left and the right line of each pair start and stop, (P, 4), as the kernels take them."""
-        i, j = np.array(pairs, dtype=np.int64).reshape(-1, 2).T
+        i, j = pairs.T
         return np.column_stack([left.starts[i], left.stops[i], self.right.starts[j], self.right.stops[j]])
 
     @cached_property
@@ -235,6 +230,10 @@ class _Crossings:
     right_px: Float
     points_mm: Float
     sine: Float
+
+    @property
+    def arrays(self) -> tuple[Int, Float, Float, Float, Float, Float]:
+        return self.left_at, self.right_at, self.left_px, self.right_px, self.points_mm, self.sine
 
     def take(self, index: Int | npt.NDArray[np.bool_] | slice) -> "_Crossings":
         return _Crossings(
@@ -277,43 +276,120 @@ def _corners(box: Workspace) -> Float:
     return np.array([r.min for r in ranges] + [r.max for r in ranges])
 
 
-def _crossings(views: _Views, left: _Lines, pairs: Sequence[tuple[int, int]], box: Workspace) -> _Found:
-    """Where the epipolar lines of left points cross right lines, in the box."""
+def _crossings(views: _Views, left: _Lines, pairs: Int, box: Workspace) -> _Found:
+    """Where the epipolar lines of left points cross right lines, in the box, for pairs of lines (P, 2)."""
     ranges = views.ranges(left, pairs)
     ends = np.zeros(len(ranges), np.int64)
-    capacity, count = _USUAL_CROSSINGS, _USUAL_CROSSINGS + 1
-    while count > capacity:
-        capacity = max(capacity, count)
-        at, crossing = np.empty(capacity, np.int64), np.empty(capacity)
-        left_px, right_px = np.empty((capacity, 2)), np.empty((capacity, 2))
-        points_mm, sine = np.empty((capacity, 3)), np.empty(capacity)
-        count = call(
-            "crossings",
-            views.packed_rig,
-            left.points_px,
-            views.right.points_px,
-            ranges,
-            len(ranges),
-            _corners(box),
-            capacity,
-            np.empty(len(views.right.points_px)),
-            at,
-            crossing,
-            left_px,
-            right_px,
-            points_mm,
-            sine,
-            ends,
+    distance = np.empty(len(views.right.points_px))
+    given = views.packed_rig, left.points_px, views.right.points_px, ranges, len(ranges), _corners(box)
+    capacity = _USUAL_CROSSINGS
+    while True:
+        room = _Crossings(
+            np.empty(capacity, np.int64),
+            np.empty(capacity),
+            np.empty((capacity, 2)),
+            np.empty((capacity, 2)),
+            np.empty((capacity, 3)),
+            np.empty(capacity),
         )
-    every = _Crossings(at, crossing, left_px, right_px, points_mm, sine)
-    return _Found(every.take(slice(count)), _starts(ends), ends)
+        count = call("crossings", *given, capacity, distance, *room.arrays, ends)
+        if count <= capacity:
+            return _Found(room.take(slice(count)), _starts(ends), ends)
+        capacity = count
 
 
-def _best_chains(found: _Found, rig: StereoRig, parameters: MatchParameters) -> list[_Chain | None]:
-    """Of each pair the longest chain, the right line taken either way, that keeps order and leaps nowhere."""
+@dataclass(frozen=True, eq=False)
+class _Chains:
+    """Chains of crossings, the best first: their lines (C, 2), each from a start to before a stop (C,), scores (C,)."""
+
+    crossings: _Crossings
+    lines: Int
+    starts: Int
+    stops: Int
+    scores: Float
+
+    def __len__(self) -> int:
+        return len(self.scores)
+
+    def chain(self, index: int) -> _Chain:
+        """One of them."""
+        cut = slice(int(self.starts[index]), int(self.stops[index]))
+        return _Chain(self.crossings.take(cut), float(self.scores[index]))
+
+    def means(self, values: Float) -> Float:
+        """The mean (C,) along each chain of values (N,) of the crossings."""
+        total = np.concatenate([[0.0], np.cumsum(values)])
+        return np.asarray((total[self.stops] - total[self.starts]) / (self.stops - self.starts))
+
+    @cached_property
+    def lengths_mm(self) -> Float:
+        """Length (C,) of each in space."""
+        along = arc_length(self.crossings.points_mm)
+        return along[self.stops - 1] - along[self.starts]
+
+    @cached_property
+    def places(self) -> Float:
+        """Places (2, N) on the left and on the right lines."""
+        return np.stack([self.crossings.left_at, self.crossings.right_at])
+
+    @cached_property
+    def reach(self) -> tuple[Float, Float]:
+        """Lowest and highest place (2, C) of each."""
+        order = np.argsort(self.starts)
+        back = np.argsort(order)
+        low, high = (
+            extreme.reduceat(self.places, self.starts[order], axis=1)[:, back] if len(self) else np.zeros((2, 0))
+            for extreme in (np.minimum, np.maximum)
+        )
+        return np.ascontiguousarray(low), np.ascontiguousarray(high)
+
+    def gone(self, workspace: Workspace) -> Int:
+        """Those that are each other's best partners, outside the workspace."""
+        is_outside = self.means(inside(workspace, self.crossings.points_mm).astype(np.float64)) <= 0.5
+        gone = np.empty(len(self), np.int64)
+        lost = call(
+            "gone_elsewhere",
+            np.ascontiguousarray(self.lines.T),
+            self.places,
+            self.places.shape[1],
+            self.starts,
+            self.stops,
+            *self.reach,
+            is_outside,
+            len(self),
+            np.empty(len(self), np.int64),
+            gone,
+        )
+        return gone[:lost]
+
+    def shares(self, others: "_Chains", gone: Int) -> Float:
+        """How much of each chain's left and right stretch (C, 2) is taken by the others that are gone."""
+        shares = np.zeros((2, len(self)))
+        call(
+            "shares_gone",
+            np.ascontiguousarray(self.lines.T),
+            self.places,
+            self.places.shape[1],
+            self.starts,
+            self.stops,
+            len(self),
+            np.ascontiguousarray(others.lines[gone].T),
+            *(np.ascontiguousarray(reach[:, gone]) for reach in others.reach),
+            len(gone),
+            np.empty(len(gone), np.int64),
+            shares,
+        )
+        return shares.T
+
+
+def _best_chains(found: _Found, lines: Int, rig: StereoRig, parameters: MatchParameters) -> _Chains:
+    """Of each pair of lines (P, 2) that has one the longest chain that keeps order and leaps nowhere.
+
+    The right line may be taken either way.
+    """
     at, groups = found.crossings, len(found.starts)
     most = int((found.stops - found.starts).max(initial=0))
-    chosen, ends, scores = np.empty(2 * len(at.left_at) + 1, np.int64), np.empty(groups, np.int64), np.empty(groups)
+    chosen, ends, scores = np.empty(len(at.left_at), np.int64), np.empty(groups, np.int64), np.empty(groups)
     call(
         "best_chains",
         at.left_at,
@@ -327,26 +403,32 @@ def _best_chains(found: _Found, rig: StereoRig, parameters: MatchParameters) -> 
         rig.left.focal_px,
         _MAX_FORESHORTENING,
         parameters.max_gap_mm,
-        np.empty(2 * most + 1),
-        np.empty(2 * most + 1, np.int64),
+        np.empty(2 * most),
+        np.empty(2 * most, np.int64),
         chosen,
         ends,
         scores,
     )
-    return [
-        _Chain(at.take(chosen[a:b]), score) if b > a else None
-        for (a, b), score in zip(pairwise([0, *ends.tolist()]), scores.tolist(), strict=True)
-    ]
+    return _ordered(at.take(chosen[: ends.max(initial=0)]), ends, lines, scores)
+
+
+def _ordered(crossings: _Crossings, ends: Int, lines: Int, scores: Float) -> _Chains:
+    """Chains that lie one behind the other, some of them of no length."""
+    starts = _starts(ends)
+    order = np.argsort(-scores, kind="stable")
+    order = order[ends[order] > starts[order]]
+    return _Chains(crossings, lines[order], starts[order], ends[order], scores[order])
 
 
 @dataclass(frozen=True, slots=True)
 class _Pairs:
-    """Lines that may be one needle within the workspace, and how many are each other's best partners elsewhere.
+    """Lines that may be one needle within the workspace, (P, 2), and how many are each other's best partners elsewhere.
 
-    With each pair comes the share of its stretches that has no better partner elsewhere.
+    own (P,): the share of their stretches that has no better partner elsewhere.
     """
 
-    within: list[tuple[int, int, float]]
+    within: Int
+    own: Float
     elsewhere: int
 
 
@@ -361,24 +443,17 @@ def _pairs(views: _Views, parameters: MatchParameters) -> _Pairs:
     everywhere = Range(min=-furthest, max=furthest)
     anywhere = Workspace(x_mm=everywhere, y_mm=everywhere, z_mm=Range(min=nearest, max=furthest))
     sparse = views.left.sparse()
-    every = [(i, j) for i in range(len(sparse)) for j in range(len(views.right))]
-    found = _crossings(views, sparse, every, anywhere)
+    lines = np.indices((len(sparse), len(views.right))).reshape(2, -1).T
+    found = _crossings(views, sparse, lines, anywhere)
     promising = _promising(found)
-    lines = np.array(every, dtype=np.int64)[promising]
     found = found.of(promising)
+    chains = _best_chains(found, lines[promising], views.rig, parameters)
     is_within = inside(workspace, found.crossings.points_mm)
-    chains = _Chains.of(_best_chains(found, views.rig, parameters), lines)
-    within = _Chains.of(_best_chains(found.within(is_within), views.rig, parameters), lines)
+    within = _best_chains(found.within(is_within), lines[promising], views.rig, parameters)
     gone = chains.gone(workspace)
     shares = within.shares(chains, gone)
-    return _Pairs(
-        [
-            (int(i), int(j), 1 - float(s.mean()))
-            for (i, j), s in zip(within.lines, shares, strict=True)
-            if s.min() <= 0.5
-        ],
-        len(gone),
-    )
+    kept = shares.min(axis=1, initial=1.0) <= 0.5
+    return _Pairs(within.lines[kept], 1 - shares[kept].mean(axis=1), len(gone))
 
 
 def _promising(found: _Found) -> Int:
@@ -392,89 +467,7 @@ def _promising(found: _Found) -> Int:
     return most[votes[most] >= 3]
 
 
-@dataclass(frozen=True, eq=False)
-class _Chains:
-    """Chains, the best first: their lines (C, 2), and places (2, all) on both from starts to stops (C,).
-
-    low, high (2, C): between which places.
-    """
-
-    chains: list[_Chain]
-    lines: Int
-    places: Float
-    starts: Int
-    stops: Int
-    low: Float
-    high: Float
-
-    @classmethod
-    def of(cls, chains: list[_Chain | None], lines: Int) -> "_Chains":
-        """Those of pairs of lines (C, 2) that have one."""
-        kept = sorted(
-            ((chain, pair) for chain, pair in zip(chains, lines, strict=True) if chain is not None),
-            key=lambda each: -each[0].score,
-        )
-        stops = np.cumsum([len(chain.crossings.left_at) for chain, _ in kept], dtype=np.int64)
-        starts = _starts(stops)
-        if not kept:
-            nothing = np.zeros((2, 0))
-            return cls([], np.zeros((0, 2), np.int64), nothing, starts, stops, nothing, nothing)
-        places = np.concatenate([[chain.crossings.left_at, chain.crossings.right_at] for chain, _ in kept], axis=1)
-        return cls(
-            [chain for chain, _ in kept],
-            np.array([pair for _, pair in kept]),
-            places,
-            starts,
-            stops,
-            np.minimum.reduceat(places, starts, axis=1),
-            np.maximum.reduceat(places, starts, axis=1),
-        )
-
-    def gone(self, workspace: Workspace) -> Int:
-        """Those that are each other's best partners, outside the workspace."""
-        if not self.chains:
-            return np.zeros(0, np.int64)
-        is_within = inside(workspace, np.concatenate([chain.crossings.points_mm for chain in self.chains]))
-        share = np.add.reduceat(is_within.astype(np.float64), self.starts) / (self.stops - self.starts)
-        count, gone = len(self.chains), np.empty(len(self.chains), np.int64)
-        lost = call(
-            "gone_elsewhere",
-            np.ascontiguousarray(self.lines.T),
-            self.places,
-            self.places.shape[1],
-            self.starts,
-            self.stops,
-            self.low,
-            self.high,
-            share <= 0.5,
-            count,
-            np.empty(count, np.int64),
-            gone,
-        )
-        return gone[:lost]
-
-    def shares(self, others: "_Chains", gone: Int) -> Float:
-        """How much of each chain's left and right stretch (C, 2) is taken by the others that are gone."""
-        shares = np.zeros((2, len(self.chains)))
-        call(
-            "shares_gone",
-            np.ascontiguousarray(self.lines.T),
-            self.places,
-            self.places.shape[1],
-            self.starts,
-            self.stops,
-            len(self.chains),
-            np.ascontiguousarray(others.lines[gone].T),
-            np.ascontiguousarray(others.low[:, gone]),
-            np.ascontiguousarray(others.high[:, gone]),
-            len(gone),
-            np.empty(len(gone), np.int64),
-            shares,
-        )
-        return shares.T
-
-
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, slots=True)
 class _Offer:
     """A chain of a left and a right line, of which `own` is not better matched elsewhere."""
 
@@ -482,16 +475,20 @@ class _Offer:
     right: int
     chain: _Chain
     own: float
-
-    @cached_property
-    def length_mm(self) -> float:
-        """Of the curve in space."""
-        return float(arc_length(self.chain.crossings.points_mm)[-1])
+    length_mm: float
 
     @property
     def at_best(self) -> float:
         """What it may be ranked by."""
         return self.own * self.chain.score
+
+
+def _offers(chains: _Chains, own: Float, chosen: npt.NDArray[np.bool_]) -> list[_Offer]:
+    return [
+        _Offer(int(i), int(j), chains.chain(k), float(own[k]), float(chains.lengths_mm[k]))
+        for k, (i, j) in enumerate(chains.lines)
+        if chosen[k]
+    ]
 
 
 def _candidate(left: Centerline, right: Centerline, offer: _Offer) -> Candidate:
@@ -515,7 +512,7 @@ def _candidate(left: Centerline, right: Centerline, offer: _Offer) -> Candidate:
     )
 
 
-def _lengthwise(views: _Views) -> list[tuple[int, int, _Chain]]:
+def _lengthwise(views: _Views) -> _Chains:
     """Pairs of lines that run mostly along the epipolar lines, matched by their ends and by how they bend.
 
     The inverse depth along the left line is a polynomial that brings it onto the right line, with its ends near the
@@ -526,23 +523,17 @@ def _lengthwise(views: _Views) -> list[tuple[int, int, _Chain]]:
     apart = apart.reshape(len(views.left), 2, len(views.right), 2)
     chord = np.linalg.norm(ends_right[:, 1] - ends_right[:, 0], axis=1)
     is_along = np.abs(apart[..., 1] - apart[..., 0]).max(axis=1) < _LENGTHWISE * chord
-    pairs: list[tuple[int, int]] = []
-    turned: list[bool] = []
+    pairs, turned = [], []
     for is_turned in (False, True):
         # First end to first end, or to the last one.
         ends = np.stack([apart[:, 0, :, int(is_turned)], apart[:, 1, :, 1 - int(is_turned)]])
-        near = np.argwhere(is_along & (np.abs(ends).max(axis=0) < _MAX_ENDS_APART_PX)).tolist()
-        pairs += [(i, j) for i, j in near]
-        turned += [is_turned] * len(near)
-    if not pairs:
-        return []
-    return [
-        (i, j, chain) for (i, j), chain in zip(pairs, _by_ends(views, pairs, turned), strict=True) if chain is not None
-    ]
+        pairs.append(np.argwhere(is_along & (np.abs(ends).max(axis=0) < _MAX_ENDS_APART_PX)))
+        turned.append(np.full(len(pairs[-1]), is_turned))
+    return _by_ends(views, np.concatenate(pairs), np.concatenate(turned))
 
 
-def _by_ends(views: _Views, pairs: list[tuple[int, int]], turned: list[bool]) -> list[_Chain | None]:
-    """The left lines at the depth that brings them onto the right ones, some turned round; None: not in the box."""
+def _by_ends(views: _Views, pairs: Int, turned: npt.NDArray[np.bool_]) -> _Chains:
+    """The left lines at the depth that brings them onto the right ones, some turned round, where that is in the box."""
     ranges = views.ranges(views.left, pairs)
     count = int((ranges[:, 1] - ranges[:, 0]).sum())
     z_mm, pose = views.workspace.z_mm, views.rig.right_from_left
@@ -558,7 +549,7 @@ def _by_ends(views: _Views, pairs: list[tuple[int, int]], turned: list[bool]) ->
         views.left.points_px,
         views.right.points_px,
         ranges,
-        np.array(turned),
+        turned,
         len(pairs),
         limits,
         np.empty(6 * len(views.left.points_px) + 2 * len(views.right.points_px)),
@@ -568,19 +559,8 @@ def _by_ends(views: _Views, pairs: list[tuple[int, int]], turned: list[bool]) ->
         points_mm,
         ends,
     )
-    chains: list[_Chain | None] = []
-    for (a, b), (start, *_) in zip(pairwise([0, *ends.tolist()]), ranges.tolist(), strict=True):
-        if a == b:
-            chains.append(None)
-            continue
-        cut = slice(a, b)
-        crossings = _Crossings(
-            at[cut],
-            nearest[cut],
-            views.left.points_px[start + at[cut]],
-            right_px[cut],
-            points_mm[cut],
-            np.ones(b - a),
-        )
-        chains.append(_Chain(crossings, float(b - a) * _LENGTHWISE))
-    return chains
+    kept = int(ends.max(initial=0))
+    lengths = np.diff(ends, prepend=0)
+    left_px = views.left.points_px[np.repeat(ranges[:, 0], lengths) + at[:kept]]
+    crossings = _Crossings(at[:kept], nearest[:kept], left_px, right_px[:kept], points_mm[:kept], np.ones(kept))
+    return _ordered(crossings, ends, pairs, lengths * _LENGTHWISE)

@@ -199,33 +199,96 @@ static inline float level(const float *image, int64_t rows, int64_t columns, flo
   return above + fy * (below[0] + fx * (below[next] - below[0]) - above);
 }
 
-/* By how much each point (n, 2) of lines differs from both its sides within `count` steps of so many pixels across their
-   direction (n, 2), and how wide it is: up to where either side differs half as much as it ever does. */
-EXPORT void two_sided(const float *image, int64_t rows, int64_t columns, const double *points, const double *along,
-                      int64_t n, double step, int64_t count, double *contrast, double *width) {
-  float difference[count];
-  for (int64_t i = 0; i < n; i++) {
-    float x = (float)points[2 * i], y = (float)points[2 * i + 1];
-    float here = level(image, rows, columns, x, y), brightest[2], darkest[2];
-    int64_t within = 0;
-    for (int side = 0; side < 2; side++) {
-      float dx = (float)((side ? -step : step) * along[2 * i + 1]), dy = (float)((side ? step : -step) * along[2 * i]);
-      float most = -INFINITY, least = INFINITY;
-      for (int64_t k = 0; k < count; k++) {
-        float d = level(image, rows, columns, x + (float)(k + 1) * dx, y + (float)(k + 1) * dy) - here;
-        most = d > most ? d : most;
-        least = d < least ? d : least;
-        difference[k] = fabsf(d);
-      }
-      brightest[side] = most, darkest[side] = -least;
-      float half = (most > -least ? most : -least) / 2;
-      int64_t k = 0;
-      while (k < count && difference[k] < half) k++;
-      within += k < count ? k : 0;
+/* By how much a point of a line of this direction differs from both its sides within `count` steps of so many pixels
+   across, and how wide it is: up to where either side differs half as much as it ever does. */
+static void look_beside(const float *image, int64_t rows, int64_t columns, const double *point, double along_x,
+                        double along_y, double step, int64_t count, float *difference, double *contrast, double *width) {
+  float x = (float)point[0], y = (float)point[1];
+  float here = level(image, rows, columns, x, y), brightest[2], darkest[2];
+  int64_t within = 0;
+  for (int side = 0; side < 2; side++) {
+    float dx = (float)((side ? -step : step) * along_y), dy = (float)((side ? step : -step) * along_x);
+    float most = -INFINITY, least = INFINITY;
+    for (int64_t k = 0; k < count; k++) {
+      float d = level(image, rows, columns, x + (float)(k + 1) * dx, y + (float)(k + 1) * dy) - here;
+      most = d > most ? d : most;
+      least = d < least ? d : least;
+      difference[k] = fabsf(d);
     }
-    float bright = brightest[0] < brightest[1] ? brightest[0] : brightest[1];
-    float dark = darkest[0] < darkest[1] ? darkest[0] : darkest[1];
-    contrast[i] = bright > dark ? bright : dark;
-    width[i] = step * (double)(within + 1);
+    brightest[side] = most, darkest[side] = -least;
+    float half = (most > -least ? most : -least) / 2;
+    int64_t k = 0;
+    while (k < count && difference[k] < half) k++;
+    within += k < count ? k : 0;
   }
+  float bright = brightest[0] < brightest[1] ? brightest[0] : brightest[1];
+  float dark = darkest[0] < darkest[1] ? darkest[0] : darkest[1];
+  *contrast = bright > dark ? bright : dark;
+  *width = step * (double)(within + 1);
+}
+
+static inline int64_t held(int64_t i, int64_t n) { return i < 0 ? 0 : i >= n ? n - 1 : i; }
+
+/* The median of values (n,) about the i-th, as far as four to either side. */
+static double median_of_nine(const double *values, int64_t i, int64_t n) {
+  double sorted[9];
+  for (int64_t k = 0; k < 9; k++) {
+    double value = values[held(i + k - 4, n)];
+    int64_t j = k;
+    for (; j > 0 && sorted[j - 1] > value; j--) sorted[j] = sorted[j - 1];
+    sorted[j] = value;
+  }
+  return sorted[4];
+}
+
+/* What a stretch must be: so many steps of so many pixels are looked at across it, `corner` points to either side tell
+   how much it turns. */
+typedef struct {
+  double step, max_width, min_contrast, max_turn_rad;
+  int64_t steps, corner, shortest;
+} TwoSided;
+
+/* The stretches of pieces of skeleton, pixels one piece behind the other up to ends (count,), that are thin, differ from
+   both their sides and have no corners: starts and stops among points (n, 2), which are smoothed, and widths (n,). How
+   many. across (steps,), contrast (n,) are for its own use. */
+EXPORT int32_t two_sided(const float *image, int64_t rows, int64_t columns, const double *pixels, const int64_t *ends,
+                         int64_t count, const TwoSided *wanted, float *across, double *contrast, double *points,
+                         double *width, int64_t *starts, int64_t *stops) {
+  int64_t found = 0, reach = wanted->corner;
+  for (int64_t piece = 0; piece < count; piece++) {
+    int64_t first = piece ? ends[piece - 1] : 0, n = ends[piece] - first, begun = -1;
+    const double *raw = pixels + 2 * first;
+    double *p = points + 2 * first, *w = width + first, *c = contrast + first;
+    for (int64_t i = 0; i < n; i++)
+      for (int d = 0; d < 2; d++) {
+        double sum = 0;
+        for (int64_t k = -2; k <= 2; k++) sum += raw[2 * held(i + k, n) + d];
+        p[2 * i + d] = sum / 5;
+      }
+    for (int64_t i = 0; i < n; i++) {
+      const double *before = p + 2 * held(i - 1, n), *after = p + 2 * held(i + 1, n);
+      double x = after[0] - before[0], y = after[1] - before[1], length = fmax(sqrt(x * x + y * y), 1e-300);
+      look_beside(image, rows, columns, p + 2 * i, x / length, y / length, wanted->step, wanted->steps, across, c + i,
+                  w + i);
+    }
+    for (int64_t i = 0; i <= n; i++) {
+      int good = i < n;
+      if (good) {
+        double sum = 0;
+        for (int64_t k = -2; k <= 2; k++) sum += c[held(i + k, n)];
+        good = sum / 5 > wanted->min_contrast && median_of_nine(w, i, n) <= wanted->max_width;
+      }
+      if (good && i >= reach && i < n - reach) {
+        const double *before = p + 2 * (i - reach), *here = p + 2 * i, *after = p + 2 * (i + reach);
+        double ax = here[0] - before[0], ay = here[1] - before[1], bx = after[0] - here[0], by = after[1] - here[1];
+        good = fabs(atan2(ax * by - ay * bx, ax * bx + ay * by)) < wanted->max_turn_rad;
+      }
+      if (good && begun < 0) begun = i;
+      if (!good && begun >= 0) {
+        if (i - begun >= wanted->shortest) starts[found] = first + begun, stops[found++] = first + i;
+        begun = -1;
+      }
+    }
+  }
+  return (int32_t)found;
 }

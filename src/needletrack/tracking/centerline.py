@@ -1,19 +1,18 @@
 """From masks of thin structures to ordered lines, followed through crossings and short gaps by their direction."""
 
-from collections.abc import Callable
+import ctypes
+import math
 from dataclasses import dataclass
-from functools import cached_property
-from itertools import pairwise
+from typing import ClassVar
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
-from scipy.ndimage import median_filter, uniform_filter1d
 
-from needletrack.geometry.spline import arc_length, unit
+from needletrack.geometry.spline import arc_length
 from needletrack.kernels import call
 from needletrack.records import Centerline, Float, Int
 from needletrack.tracking.needle import Positive
-from needletrack.tracking.segment import Mask, Ridges
+from needletrack.tracking.segment import Gray, Mask, Ridges
 
 # Shorter pieces have no direction that could be continued; reduced px.
 _MIN_PIECE_PX = 6
@@ -21,8 +20,6 @@ _END_PX = 10
 # A corner is a turn within so many pixels to either side.
 _CORNER_PX = 6
 _WIDTH_STEP = 0.5
-# Filters along a line reach at most so many pixels.
-_REACH = 4
 # Blur widens a line, and a skeleton's width is coarse: only what is clearly too wide is left out here.
 _WIDTH_ALLOWANCE = 1.5
 
@@ -78,14 +75,15 @@ def trace_centerlines(
 ) -> list[Centerline]:
     """Ordered lines of at most the given width, raw px, longest first; which end is the base is not known here."""
     reach = _WIDTH_ALLOWANCE * max_width_px / ridges.reduction + 1.0
-    skeletons = [points for mask in (ridges.bright, ridges.dark) for points in _skeleton_pieces(mask)]
-    pieces = _two_sided(skeletons, ridges, reach, parameters)
+    (bright, bright_ends), (dark, dark_ends) = (_skeleton_pieces(mask) for mask in (ridges.bright, ridges.dark))
+    pixels, ends = np.concatenate([bright, dark]), np.concatenate([bright_ends, dark_ends + len(bright)])
+    pieces = _two_sided(pixels, ends, ridges.reduced, reach, parameters)
     chains = _linked(pieces, parameters.max_gap_mm * px_per_mm / ridges.reduction, parameters.max_turn_deg)
     return _centerlines(pieces, chains, ridges.reduction)
 
 
-def _skeleton_pieces(mask: Mask) -> list[Float]:
-    """The unbranched stretches (N, 2) of a mask's skeleton, reduced pixels in order along each."""
+def _skeleton_pieces(mask: Mask) -> tuple[Float, Int]:
+    """The unbranched stretches of a mask's skeleton: reduced pixels (N, 2), in order along each up to its end (P,)."""
     rows, columns = mask.shape
     # What is scratch here is as large as the mask, of which a few percent are touched.
     points, ends = np.empty((mask.size, 2)), np.empty(mask.size, np.int64)
@@ -100,84 +98,56 @@ def _skeleton_pieces(mask: Mask) -> list[Float]:
         points,
         ends,
     )
-    return [points[a:b].copy() for a, b in pairwise([0, *ends[:count].tolist()])]
+    return points[: ends[count - 1] if count else 0], ends[:count]
 
 
-def _two_sided(pieces: list[Float], ridges: Ridges, max_width: float, parameters: CenterlineParameters) -> _Pieces:
-    """The stretches of all pieces that differ from both sides: an edge of something wide differs from one only.
+class _TwoSided(ctypes.Structure):
+    """What a stretch must be, as the kernel takes it."""
+
+    _fields_: ClassVar = [
+        ("step", ctypes.c_double),
+        ("max_width", ctypes.c_double),
+        ("min_contrast", ctypes.c_double),
+        ("max_turn_rad", ctypes.c_double),
+        ("steps", ctypes.c_int64),
+        ("corner", ctypes.c_int64),
+        ("shortest", ctypes.c_int64),
+    ]
+
+
+def _two_sided(pixels: Float, ends: Int, image: Gray, max_width: float, parameters: CenterlineParameters) -> _Pieces:
+    """The stretches of pieces that differ from both sides: an edge of something wide differs from one only.
 
     They end at corners too, where a skeleton goes over from the needle to the edge of its sleeve.
     """
-    if not pieces:
-        nothing = np.zeros(0, np.int64)
-        return _Pieces(np.zeros((0, 2)), np.zeros(0), nothing, nothing)
-    ends = np.cumsum([len(points) for points in pieces])
-    runs = _Runs(ends - [len(points) for points in pieces], ends)
-    smooth = runs.filtered(lambda x: uniform_filter1d(x, 5, axis=0), np.concatenate(pieces))
-    along = unit(smooth[runs.beside(1)] - smooth[runs.beside(-1)])
-    contrast, width = np.empty(len(smooth)), np.empty(len(smooth))
-    image = ridges.reduced
-    steps = len(np.arange(_WIDTH_STEP, max_width + 2.0, _WIDTH_STEP))
-    call("two_sided", image, *image.shape, smooth, along, len(smooth), _WIDTH_STEP, steps, contrast, width)
-    good = runs.filtered(lambda x: uniform_filter1d(x, 5), contrast) > parameters.min_contrast_gray
-    good &= runs.filtered(lambda x: median_filter(x, 9), width) <= max_width
-    good &= _turn_deg(smooth, runs) < parameters.max_turn_deg
-    # A stretch is a run of good points of one piece.
-    begins, stops = good.copy(), good.copy()
-    begins[1:] &= ~good[:-1]
-    stops[:-1] &= ~good[1:]
-    begins[runs.starts] = good[runs.starts]
-    stops[runs.ends - 1] = good[runs.ends - 1]
-    starts, behind = np.flatnonzero(begins), np.flatnonzero(stops) + 1
-    long_enough = behind - starts >= _MIN_PIECE_PX
-    return _Pieces(smooth, width, starts[long_enough], behind[long_enough])
-
-
-@dataclass(frozen=True, eq=False)
-class _Runs:
-    """Pieces one behind the other in one array, each from a start to before an end: (P,) indices."""
-
-    starts: Int
-    ends: Int
-
-    @cached_property
-    def lengths(self) -> Int:
-        """Of each piece (P,)."""
-        return self.ends - self.starts
-
-    def beside(self, step: int) -> Int:
-        """The point (N,) so many further along the piece; the piece's last or first one, where it ends before."""
-        at = np.arange(self.ends[-1]) + step
-        return np.asarray(np.clip(at, np.repeat(self.starts, self.lengths), np.repeat(self.ends - 1, self.lengths)))
-
-    def filtered(self, along: Callable[[Float], Float], values: Float) -> Float:
-        """What a filter along the first axis, of a reach of at most _REACH, makes of each piece, its ends repeated."""
-        return along(values[self._padded])[self._inner]
-
-    @cached_property
-    def _padded(self) -> Int:
-        first = self.starts - np.arange(len(self.starts)) * 2 * _REACH
-        at = np.arange(self.ends[-1] + 2 * _REACH * len(self.starts)) - _REACH
-        longer = self.lengths + 2 * _REACH
-        shift = np.repeat(first - self.starts, longer)
-        return np.asarray(np.clip(at + shift, np.repeat(self.starts, longer), np.repeat(self.ends - 1, longer)))
-
-    @cached_property
-    def _inner(self) -> Int:
-        before = (2 * np.arange(len(self.starts)) + 1) * _REACH
-        return np.asarray(np.arange(self.ends[-1]) + np.repeat(before, self.lengths))
-
-
-def _turn_deg(points: Float, runs: _Runs) -> Float:
-    """By how much (N,) lines turn about each of their points (N, 2); 0 near their ends."""
-    before = points - points[runs.beside(-_CORNER_PX)]
-    after = points[runs.beside(_CORNER_PX)] - points
-    cross = before[:, 0] * after[:, 1] - before[:, 1] * after[:, 0]
-    turn = np.degrees(np.abs(np.arctan2(cross, (before * after).sum(axis=1))))
-    at = np.arange(len(points))
-    inner = at - np.repeat(runs.starts, runs.lengths) >= _CORNER_PX
-    inner &= np.repeat(runs.ends, runs.lengths) - at > _CORNER_PX
-    return np.where(inner, turn, 0.0)
+    steps = math.ceil((max_width + 2.0) / _WIDTH_STEP) - 1
+    wanted = _TwoSided(
+        _WIDTH_STEP,
+        max_width,
+        parameters.min_contrast_gray,
+        math.radians(parameters.max_turn_deg),
+        steps,
+        _CORNER_PX,
+        _MIN_PIECE_PX,
+    )
+    points, width = np.empty_like(pixels), np.empty(len(pixels))
+    starts, stops = np.empty(len(pixels), np.int64), np.empty(len(pixels), np.int64)
+    count = call(
+        "two_sided",
+        image,
+        *image.shape,
+        np.ascontiguousarray(pixels),
+        ends,
+        len(ends),
+        wanted,
+        np.empty(steps, np.float32),
+        np.empty(len(pixels)),
+        points,
+        width,
+        starts,
+        stops,
+    )
+    return _Pieces(points, width, starts[:count], stops[:count])
 
 
 _Chain = list[tuple[int, bool]]
@@ -189,12 +159,11 @@ def _linked(pieces: _Pieces, max_gap: float, max_turn_deg: float) -> list[_Chain
     Every end joins at most one other, the straightest and nearest continuation first.
     """
     position, outward = pieces.ends()
-    gap = position[None] - position[:, None]
-    near = np.triu((gap**2).sum(axis=2) < max_gap**2, 1)
-    a, b = np.nonzero(near)
-    of_two = a // 2 != b // 2
+    x, y = position.T
+    a, b = np.nonzero((x - x[:, None]) ** 2 + (y - y[:, None]) ** 2 < max_gap**2)
+    of_two = a // 2 < b // 2
     a, b = a[of_two], b[of_two]
-    towards = gap[a, b]
+    towards = position[b] - position[a]
     distance = np.linalg.norm(towards, axis=1)
     towards /= np.maximum(distance, 1e-9)[:, None]
     # Across a gap of a pixel or two its direction is noise: only the turn between the pieces counts.

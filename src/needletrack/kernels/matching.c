@@ -44,33 +44,41 @@ static int is_inside(const double *box, const double *point) {
 
 /* As a share of the step from one point of a line to the next. */
 #define ENDS_MEET 1e-6
+#define ENDS_NEAR_PX 1e-3
 
-/* Where the epipolar lines of left points cross right lines, for each pair of lines: pairs (count, 4) are the first and
-   behind the last point of the left and of the right line. Found, in the box (lowest corner, highest corner), are: the
-   left point, counted from the line's first, how far along the right line, in its points, where in both views, in
-   space, and the sine of the angle; ends (count,): where each pair's stop. How many; beyond the capacity none is kept. */
-EXPORT int32_t crossings(const Rig *rig, const double *left_px, const double *right_px, const int64_t *pairs,
-                         int64_t count, const double *box, int64_t capacity, double *distance, int64_t *left_at,
-                         double *right_at, double *crossed_left_px, double *crossed_right_px, double *points_mm,
-                         double *sine, int64_t *ends) {
+/* Where the epipolar lines of left points, lines (N, 3) of unit normals, cross right lines, for each pair of lines:
+   pairs (count, 4) are the first and behind the last point of the left and of the right line. Found, in the box (lowest
+   corner, highest corner), are: the left point, counted from the line's first, how far along the right line, in its
+   points, where in both views, in space, and the sine of the angle; ends (count,): where each pair's stop. How many;
+   beyond the capacity none is kept. */
+EXPORT int32_t crossings(const Rig *rig, const double *left_px, const double *lines, const double *right_px,
+                         const int64_t *pairs, int64_t count, const double *box, int64_t capacity, double *distance,
+                         int64_t *left_at, double *right_at, double *crossed_left_px, double *crossed_right_px,
+                         double *points_mm, double *sine, int64_t *ends) {
   int64_t found = 0;
   for (int64_t p = 0; p < count; p++) {
     const int64_t *range = pairs + 4 * p;
     const double *right = right_px + 2 * range[2];
     int64_t n = range[3] - range[2];
     for (int64_t i = range[0]; i < range[1]; i++) {
-      double at[3] = {left_px[2 * i], left_px[2 * i + 1], 1}, line[3], left_ray[3];
-      times(rig->fundamental, at, line);
-      double scale = 1 / sqrt(line[0] * line[0] + line[1] * line[1]);
-      double a = line[0] * scale, b = line[1] * scale, c = line[2] * scale;
-      for (int64_t j = 0; j < n; j++) distance[j] = a * right[2 * j] + b * right[2 * j + 1] + c;
+      double at[3] = {left_px[2 * i], left_px[2 * i + 1], 1}, left_ray[3];
+      double a = lines[3 * i], b = lines[3 * i + 1], c = lines[3 * i + 2], least = INFINITY, most = -INFINITY;
+      for (int64_t j = 0; j < n; j++) {
+        double d = a * right[2 * j] + b * right[2 * j + 1] + c;
+        distance[j] = d;
+        least = d < least ? d : least;
+        most = d > most ? d : most;
+      }
+      /* Most lines lie to one side of most epipolar lines, and their ends not near them. */
+      if (least > ENDS_NEAR_PX || most < -ENDS_NEAR_PX) continue;
       int has_ray = 0;
       for (int64_t j = 0; j + 1 < n; j++) {
         double near = distance[j], far = distance[j + 1];
+        if ((near < 0) == (far < 0) && j > 0 && j + 2 < n) continue;
         double share = near / (near - far);
         /* Ends of lines that are each other's partners meet, whatever rounding says. */
-        if ((near < 0) == (far < 0) && !(j == 0 && fabs(share) < ENDS_MEET) && !(j + 2 == n && fabs(share - 1) < ENDS_MEET))
-          continue;
+        int at_end = (j == 0 && fabs(share) < ENDS_MEET) || (j + 2 == n && fabs(share - 1) < ENDS_MEET);
+        if ((near < 0) == (far < 0) && !at_end) continue;
         if (!has_ray) unit_ray(rig->ray_of_left, at, left_ray), has_ray = 1;
         double dx = right[2 * j + 2] - right[2 * j], dy = right[2 * j + 3] - right[2 * j + 1];
         double px[2] = {right[2 * j] + share * dx, right[2 * j + 1] + share * dy}, right_ray[3], point[3];

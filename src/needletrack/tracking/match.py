@@ -16,7 +16,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from needletrack.errors import NeedleNotFound
 from needletrack.geometry.camera import Camera
-from needletrack.geometry.epipolar import epipolar_distance_map_px
+from needletrack.geometry.epipolar import epipolar_distance_map_px, epipolar_lines
 from needletrack.geometry.spline import arc_length
 from needletrack.geometry.stereo import StereoRig
 from needletrack.kernels import call
@@ -39,6 +39,8 @@ class MatchParameters(BaseModel):
 # Along the needle, a step in space is at most so many times the step that the left view shows: turned 70 degrees away.
 _MAX_FORESHORTENING = 3.0
 _COARSE_STRIDE = 4
+# Points along the lines are no closer than this far away.
+_LEAST_STEP_MM = 0.85
 # Scenes with vessels have up to 100 pairs; a pattern of stripes has thousands, and none of them is a needle.
 _MAX_PAIRS = 150
 # Room for crossings to begin with.
@@ -104,9 +106,9 @@ def match_lines(
     """Candidates for the needle, the best supported one first; raises NeedleNotFound where there is none."""
     if not left or not right:
         raise NeedleNotFound("match", Reason.NO_CANDIDATE)
-    views = _Views(
-        _resampled(left, rig.left, parameters.step_px), _resampled(right, rig.right, parameters.step_px), rig, workspace
-    )
+    # Lines of large images were traced on reduced ones: more points than that tell nothing new.
+    step_px = max(parameters.step_px, _LEAST_STEP_MM * rig.left.focal_px / workspace.z_mm.max)
+    views = _Views(_resampled(left, rig.left, step_px), _resampled(right, rig.right, step_px), rig, workspace)
     pairs = _pairs(views, parameters)
     least_mm = needle.min_length_mm / 2
     shape = len(left), len(right)
@@ -281,7 +283,8 @@ def _crossings(views: _Views, left: _Lines, pairs: Int, box: Workspace) -> _Foun
     ranges = views.ranges(left, pairs)
     ends = np.zeros(len(ranges), np.int64)
     distance = np.empty(len(views.right.points_px))
-    given = views.packed_rig, left.points_px, views.right.points_px, ranges, len(ranges), _corners(box)
+    lines = epipolar_lines(views.rig.fundamental, left.points_px)
+    given = views.packed_rig, left.points_px, lines, views.right.points_px, ranges, len(ranges), _corners(box)
     capacity = _USUAL_CROSSINGS
     while True:
         room = _Crossings(

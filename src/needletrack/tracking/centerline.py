@@ -20,6 +20,8 @@ _END_PX = 10
 # A corner is a turn within so many pixels to either side.
 _CORNER_PX = 6
 _WIDTH_STEP = 0.5
+# Gaps from four pixels on; places are means of five whole pixels, so that distances of just 4 are common.
+_FAR_PX = 3.997
 # Blur widens a line, and a skeleton's width is coarse: only what is clearly too wide is left out here.
 _WIDTH_ALLOWANCE = 1.5
 
@@ -167,7 +169,7 @@ def _linked(pieces: _Pieces, max_gap: float, max_turn_deg: float) -> list[_Chain
     distance = np.linalg.norm(towards, axis=1)
     towards /= np.maximum(distance, 1e-9)[:, None]
     # Across a gap of a pixel or two its direction is noise: only the turn between the pieces counts.
-    far = distance > 4.0
+    far = distance > _FAR_PX
     cosines = np.stack(
         [
             -(outward[a] * outward[b]).sum(axis=1),

@@ -6,7 +6,7 @@ bright needle must not swallow it.
 """
 
 import math
-import threading
+from contextvars import ContextVar
 from dataclasses import dataclass
 
 import cv2
@@ -66,26 +66,29 @@ def find_ridges(image: Image, width_range_px: tuple[float, float], parameters: S
     return Ridges(_hysteresis(bright, parameters), _hysteresis(dark, parameters), reduced, reduction)
 
 
-class _Scratch(threading.local):
+class _Scratch:
     """Arrays for what is computed on the way, kept from call to call: fresh ones cost more than what fills them.
 
     Handed back to the system and fetched again page by page they took three quarters of this stage's time.
     """
 
-    def __init__(self) -> None:
-        self.shape = (0, 0)
+    def __init__(self, shape: tuple[int, int]) -> None:
+        self.shape = shape
+        self.grays = [np.empty(shape, np.float32) for _ in range(4)]
+        self.responses = np.empty(shape, np.float32), np.empty(shape, np.float32)
+        self.pixels = np.empty(shape, np.int32)
 
-    def of(self, shape: tuple[int, int]) -> "_Scratch":
-        """The arrays for images of a shape (rows, columns)."""
-        if self.shape != shape:
-            self.shape = shape
-            self.grays = [np.empty(shape, np.float32) for _ in range(4)]
-            self.responses = np.empty(shape, np.float32), np.empty(shape, np.float32)
-            self.pixels = np.empty(shape, np.int32)
-        return self
+    @staticmethod
+    def of(shape: tuple[int, int]) -> "_Scratch":
+        """The arrays for images of a shape (rows, columns); every thread has its own."""
+        kept = _kept.get(None)
+        if kept is None or kept.shape != shape:
+            kept = _Scratch(shape)
+            _kept.set(kept)
+        return kept
 
 
-_scratch = _Scratch()
+_kept: ContextVar[_Scratch] = ContextVar("_kept")
 
 
 def _reduced(image: Image, reduction: int) -> Gray:
@@ -98,7 +101,7 @@ def _reduced(image: Image, reduction: int) -> Gray:
 
 
 def _line_responses(image: Gray, sigmas_px: tuple[float, ...]) -> tuple[Gray, Gray]:
-    scratch = _scratch.of(image.shape)
+    scratch = _Scratch.of(image.shape)
     bright, dark = scratch.responses
     bright.fill(0)
     dark.fill(0)
@@ -130,5 +133,5 @@ def _hysteresis(response: Gray, parameters: SegmentParameters) -> Mask:
     high = max(parameters.high_threshold_noise * noise, parameters.min_response_gray)
     low = min(high, max(parameters.low_threshold_noise * noise, parameters.min_response_gray / 2))
     mask = np.empty(response.shape, np.bool_)
-    call("hysteresis", response, *response.shape, float(low), float(high), _scratch.of(response.shape).pixels, mask)
+    call("hysteresis", response, *response.shape, float(low), float(high), _Scratch.of(response.shape).pixels, mask)
     return mask

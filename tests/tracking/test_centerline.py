@@ -15,7 +15,7 @@ from needletrack.geometry.spline import arc_length, distance_from_curve
 from needletrack.records import Centerline, Float, Image
 from needletrack.synthetic.world import Rod
 from needletrack.tracking.centerline import CenterlineParameters, trace_centerlines
-from needletrack.tracking.segment import SegmentParameters, find_ridges
+from needletrack.tracking.segment import Ridges, SegmentParameters, find_ridges
 
 BACKGROUND, DARK = 200.0, 40.0
 LINE_PX = 5.0
@@ -191,3 +191,19 @@ def test_lines_come_longest_first_and_none_from_a_plain_image() -> None:
     assert len(lengths) == 3
     assert all(longer > shorter for longer, shorter in pairwise(lengths))
     assert lines_in(exposed(plain())) == []
+
+
+@settings(max_examples=25)
+@given(st.integers(0, 2**32 - 1), st.floats(0.5, 3.0))
+def test_lines_of_any_mask_run_on_and_stay_inside_it(seed: int, blur_px: float) -> None:
+    # Blobs, bands and holes of all shapes; what differs from both sides everywhere, so that nothing is left out.
+    rng = np.random.default_rng(seed)
+    mask = cv2.GaussianBlur(rng.normal(size=(60, 80)), (0, 0), blur_px) > 0
+    mask[[0, -1]] = mask[:, [0, -1]] = False
+    ridges = Ridges(mask, np.zeros_like(mask), (100.0 * mask).astype(np.float32), 1)
+    parameters = CenterlineParameters(max_gap_mm=0.1, max_turn_deg=170.0, min_contrast_gray=1e-3)
+    for line in trace_centerlines(ridges, 100.0, 1.0, parameters):
+        columns, rows = np.rint(line.points_px).astype(int).T
+        near = cv2.dilate(mask.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+        assert near[rows, columns].all()
+        assert np.linalg.norm(np.diff(line.points_px, axis=0), axis=1).max() < 1.5

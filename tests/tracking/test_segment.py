@@ -1,5 +1,7 @@
 """Ridges of drawn needles, and of what is no line: both polarities, noise, wide bands, blobs, faint contrast."""
 
+from concurrent.futures import ThreadPoolExecutor
+
 import numpy as np
 import numpy.typing as npt
 import pytest
@@ -144,3 +146,29 @@ def test_a_line_of_light_is_a_line_of_dark_in_the_negative() -> None:
     assert (ridges.dark != negative.bright).mean() < 1e-3
     assert (ridges.bright != negative.dark).mean() < 1e-3
     assert ridges.dark.mean() > 1e-2
+
+
+def test_images_of_different_sizes_and_threads_do_not_disturb_each_other() -> None:
+    # Arrays are kept from call to call, for each thread its own.
+    image = scene("steel").images[0]
+    images = [image, image[:300, :400].copy()] * 3
+    alone = [ridges_of(each) for each in images]
+    with ThreadPoolExecutor(2) as pool:
+        together = list(pool.map(ridges_of, images))
+    for one, other in zip(alone, together, strict=True):
+        assert np.array_equal(one.bright, other.bright)
+        assert np.array_equal(one.dark, other.dark)
+    assert alone[0].dark.any()
+
+
+@pytest.mark.parametrize("reduction", [1, 2, 3, 5])
+def test_images_are_reduced_to_the_means_of_whole_squares(reduction: int) -> None:
+    image = np.random.default_rng(2).integers(0, 256, (31, 47), dtype=np.uint8)
+    # The thinnest line is to be 0.9 px wide after it.
+    found = ridges_of(image, (0.9 * reduction, 4.0 * reduction))
+    assert found.reduction == reduction
+    rows, columns = 31 // reduction, 47 // reduction
+    squares = image[: rows * reduction, : columns * reduction].reshape(rows, reduction, columns, reduction)
+    means = squares.mean(axis=(1, 3))
+    assert found.reduced.shape == (rows, columns)
+    assert np.abs(found.reduced - means).max() <= 0.5 + 1e-4

@@ -1,18 +1,18 @@
 """From masks of thin structures to ordered lines, followed through crossings and short gaps by their direction."""
 
+import ctypes
+import math
 from dataclasses import dataclass
+from typing import ClassVar
 
-import cv2
 import numpy as np
-import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict, Field
-from scipy.ndimage import map_coordinates, median_filter, uniform_filter1d
-from skimage.morphology import skeletonize
 
-from needletrack.geometry.spline import arc_length, tangents
-from needletrack.records import Centerline, Float
+from needletrack.geometry.spline import arc_length
+from needletrack.kernels import call
+from needletrack.records import Centerline, Float, Int
 from needletrack.tracking.needle import Positive
-from needletrack.tracking.segment import Mask, Ridges
+from needletrack.tracking.segment import Gray, Mask, Ridges
 
 # Shorter pieces have no direction that could be continued; reduced px.
 _MIN_PIECE_PX = 6
@@ -20,6 +20,8 @@ _END_PX = 10
 # A corner is a turn within so many pixels to either side.
 _CORNER_PX = 6
 _WIDTH_STEP = 0.5
+# Gaps from four pixels on; places are means of five whole pixels, so that distances of just 4 are common.
+_FAR_PX = 3.997
 # Blur widens a line, and a skeleton's width is coarse: only what is clearly too wide is left out here.
 _WIDTH_ALLOWANCE = 1.5
 
@@ -38,19 +40,36 @@ class CenterlineParameters(BaseModel):
     )
 
 
-@dataclass(frozen=True, slots=True)
-class _Piece:
-    """Reduced pixels (N, 2) in order along one unbranched stretch of skeleton, and the width (N,) seen there."""
+@dataclass(frozen=True, eq=False)
+class _Pieces:
+    """Unbranched stretches of skeleton: reduced pixels (N, 2) in order along each, width (N,) seen there.
+
+    One behind the other, each from a start to before a stop, (P,).
+    """
 
     points: Float
     width: Float
+    starts: Int
+    stops: Int
 
-    def end(self, which: int) -> tuple[Float, Float]:
-        """Position and outward unit direction of the first (0) or the last (1) end."""
-        stretch = self.points[:_END_PX][::-1] if which == 0 else self.points[-_END_PX:]
-        centered = stretch - stretch.mean(axis=0)
-        axis = np.linalg.svd(centered, full_matrices=False)[2][0]
-        return stretch[-1], axis if axis @ (stretch[-1] - stretch[0]) >= 0 else -axis
+    def ends(self) -> tuple[Float, Float]:
+        """Position and outward unit direction (2 P, 2) of the first and the last end of each."""
+        first = np.repeat(self.starts, 2)
+        last = np.repeat(self.stops, 2) - 1
+        at = np.stack([self.starts, self.stops - 1], axis=1).ravel()
+        inwards = np.tile([1, -1], len(self.starts))
+        index = at[:, None] + inwards[:, None] * np.arange(_END_PX)
+        valid = (index >= first[:, None]) & (index <= last[:, None])
+        stretch = self.points[np.clip(index, first[:, None], last[:, None])]
+        count = valid.sum(axis=1)
+        centered = stretch - ((stretch * valid[..., None]).sum(axis=1) / count[:, None])[:, None]
+        x, y = centered[..., 0] * valid, centered[..., 1] * valid
+        # The longer axis of the points' moments.
+        angle = np.arctan2(2 * (x * y).sum(axis=1), (x * x).sum(axis=1) - (y * y).sum(axis=1)) / 2
+        axis = np.column_stack([np.cos(angle), np.sin(angle)])
+        position = self.points[at]
+        outward = position - stretch[np.arange(len(at)), count - 1]
+        return position, np.where((axis * outward).sum(axis=1, keepdims=True) >= 0, axis, -axis)
 
 
 def trace_centerlines(
@@ -58,159 +77,152 @@ def trace_centerlines(
 ) -> list[Centerline]:
     """Ordered lines of at most the given width, raw px, longest first; which end is the base is not known here."""
     reach = _WIDTH_ALLOWANCE * max_width_px / ridges.reduction + 1.0
-    pieces: list[_Piece] = []
-    for mask in (ridges.bright, ridges.dark):
-        for points in _skeleton_pieces(mask):
-            pieces.extend(_two_sided(points, ridges, reach, parameters))
+    (bright, bright_ends), (dark, dark_ends) = (_skeleton_pieces(mask) for mask in (ridges.bright, ridges.dark))
+    pixels, ends = np.concatenate([bright, dark]), np.concatenate([bright_ends, dark_ends + len(bright)])
+    pieces = _two_sided(pixels, ends, ridges.reduced, reach, parameters)
     chains = _linked(pieces, parameters.max_gap_mm * px_per_mm / ridges.reduction, parameters.max_turn_deg)
-    lines = [_centerline(chain, ridges.reduction) for chain in chains]
-    return sorted(lines, key=lambda line: -float(arc_length(line.points_px)[-1]))
+    return _centerlines(pieces, chains, ridges.reduction)
 
 
-def _skeleton_pieces(mask: Mask) -> list[Float]:
-    left, top, width, height = cv2.boundingRect(mask.astype(np.uint8))
-    if width == 0:
-        return []
-    # A rim of background, for the neighbours; what is outside the bounding box costs time and holds nothing.
-    skeleton = np.pad(skeletonize(mask[top : top + height, left : left + width]), 1)
-    neighbours = cv2.filter2D(skeleton.astype(np.uint8), -1, np.ones((3, 3)), borderType=cv2.BORDER_CONSTANT) - 1
-    branching = cv2.dilate((skeleton & (neighbours > 2)).astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
-    open_skeleton = (skeleton & ~branching).astype(np.uint8)
-    count, labels, stats, _ = cv2.connectedComponentsWithStats(open_skeleton, connectivity=8)
-    degree = cv2.filter2D(open_skeleton, -1, np.ones((3, 3)), borderType=cv2.BORDER_CONSTANT)
-    rows, columns = np.nonzero(open_skeleton)
-    # Sorted by piece, and an end of each piece before its other pixels.
-    order = np.lexsort((degree[rows, columns], labels[rows, columns]))
-    flat = (rows * open_skeleton.shape[1] + columns)[order]
-    starts = np.concatenate([[0], np.cumsum(stats[1:, cv2.CC_STAT_AREA])])
-    pieces = []
-    for i in range(count - 1):
-        if starts[i + 1] - starts[i] >= _MIN_PIECE_PX:
-            path = _walk(flat[starts[i] : starts[i + 1]].tolist(), open_skeleton.shape[1])
-            row, column = np.divmod(path, open_skeleton.shape[1])
-            pieces.append(np.column_stack([column + left - 1.0, row + top - 1.0]))
-    return pieces
-
-
-def _walk(pixels: list[int], width: int) -> npt.NDArray[np.int64]:
-    """The pixels of one unbranched stretch, as flat indices into an image of that width, in order from the first."""
-    # Straight steps before diagonal ones, so that a corner of the staircase is not jumped.
-    steps = (1, -1, width, -width, width + 1, width - 1, 1 - width, -1 - width)
-    left = set(pixels)
-    at = pixels[0]
-    path = [at]
-    left.remove(at)
-    while left:
-        for step in steps:
-            if at + step in left:
-                at += step
-                left.remove(at)
-                path.append(at)
-                break
-        else:
-            break
-    return np.array(path)
-
-
-def _two_sided(points: Float, ridges: Ridges, max_width: float, parameters: CenterlineParameters) -> list[_Piece]:
-    """The stretches of a piece that differ from both sides: an edge of something wide differs from one only.
-
-    They end at corners too, where a skeleton goes over from the needle to the edge of its sleeve.
-    """
-    smooth = uniform_filter1d(points, 5, axis=0, mode="nearest")
-    along = tangents(smooth)
-    normal = np.column_stack([-along[:, 1], along[:, 0]])
-    distances = np.arange(_WIDTH_STEP, max_width + 2.0, _WIDTH_STEP)
-    across = smooth[None, None] + np.multiply.outer(np.outer((-1, 1), distances), normal)
-    middle = _sample(ridges.reduced, smooth)
-    differences = _sample(ridges.reduced, across.reshape(-1, 2)).reshape(2, len(distances), -1) - middle
-    side_contrast = np.abs(differences).max(axis=1)
-    brighter = np.minimum(*differences.max(axis=1))
-    darker = np.minimum(*(-differences).max(axis=1))
-    contrast = np.maximum(brighter, darker)
-    width = _WIDTH_STEP * (np.abs(differences) < side_contrast[:, None] / 2).argmin(axis=1).sum(axis=0) + _WIDTH_STEP
-    good = (uniform_filter1d(contrast, 5, mode="nearest") > parameters.min_contrast_gray) & (
-        median_filter(width, 9, mode="nearest") <= max_width
+def _skeleton_pieces(mask: Mask) -> tuple[Float, Int]:
+    """The unbranched stretches of a mask's skeleton: reduced pixels (N, 2), in order along each up to its end (P,)."""
+    rows, columns = mask.shape
+    # What is scratch here is as large as the mask, of which a few percent are touched.
+    points, ends = np.empty((mask.size, 2)), np.empty(mask.size, np.int64)
+    count = call(
+        "skeleton_pieces",
+        np.ascontiguousarray(mask),
+        rows,
+        columns,
+        _MIN_PIECE_PX,
+        np.empty((rows + 2, columns + 2), np.uint8),
+        np.empty((2, mask.size), np.int32),
+        points,
+        ends,
     )
-    good &= _turn_deg(smooth) < parameters.max_turn_deg
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], good.astype(np.int8), [0]])))
-    return [
-        _Piece(smooth[a:b], width[a:b]) for a, b in zip(edges[::2], edges[1::2], strict=True) if b - a >= _MIN_PIECE_PX
+    return points[: ends[count - 1] if count else 0], ends[:count]
+
+
+class _TwoSided(ctypes.Structure):
+    """What a stretch must be, as the kernel takes it."""
+
+    _fields_: ClassVar = [
+        ("step", ctypes.c_double),
+        ("max_width", ctypes.c_double),
+        ("min_contrast", ctypes.c_double),
+        ("max_turn_rad", ctypes.c_double),
+        ("steps", ctypes.c_int64),
+        ("corner", ctypes.c_int64),
+        ("shortest", ctypes.c_int64),
     ]
 
 
-def _turn_deg(points: Float) -> Float:
-    """By how much (N,) a line turns about each of its points (N, 2); 0 near its ends."""
-    turn = np.zeros(len(points))
-    if len(points) > 2 * _CORNER_PX:
-        chord = points[_CORNER_PX:] - points[:-_CORNER_PX]
-        before, after = chord[:-_CORNER_PX], chord[_CORNER_PX:]
-        cross = before[:, 0] * after[:, 1] - before[:, 1] * after[:, 0]
-        turn[_CORNER_PX:-_CORNER_PX] = np.degrees(np.abs(np.arctan2(cross, (before * after).sum(axis=1))))
-    return turn
+def _two_sided(pixels: Float, ends: Int, image: Gray, max_width: float, parameters: CenterlineParameters) -> _Pieces:
+    """The stretches of pieces that differ from both sides: an edge of something wide differs from one only.
+
+    They end at corners too, where a skeleton goes over from the needle to the edge of its sleeve.
+    """
+    steps = math.ceil((max_width + 2.0) / _WIDTH_STEP) - 1
+    wanted = _TwoSided(
+        _WIDTH_STEP,
+        max_width,
+        parameters.min_contrast_gray,
+        math.radians(parameters.max_turn_deg),
+        steps,
+        _CORNER_PX,
+        _MIN_PIECE_PX,
+    )
+    points, width = np.empty_like(pixels), np.empty(len(pixels))
+    starts, stops = np.empty(len(pixels), np.int64), np.empty(len(pixels), np.int64)
+    count = call(
+        "two_sided",
+        image,
+        *image.shape,
+        np.ascontiguousarray(pixels),
+        ends,
+        len(ends),
+        wanted,
+        np.empty(steps, np.float32),
+        np.empty(len(pixels)),
+        points,
+        width,
+        starts,
+        stops,
+    )
+    return _Pieces(points, width, starts[:count], stops[:count])
 
 
-def _sample(image: npt.NDArray[np.float32], points: Float) -> Float:
-    return np.asarray(map_coordinates(image, points[:, ::-1].T, order=1, mode="nearest"), dtype=np.float64)
+_Chain = list[tuple[int, bool]]
 
 
-def _linked(pieces: list[_Piece], max_gap: float, max_turn_deg: float) -> list[list[_Piece]]:
-    """Chains of pieces: every end joins at most one other, the straightest and nearest continuation first."""
-    if not pieces:
-        return []
-    ends = [(i, which) for i in range(len(pieces)) for which in (0, 1)]
-    located = [pieces[i].end(which) for i, which in ends]
-    position = np.array([p for p, _ in located])
-    outward = np.array([d for _, d in located])
-    owner = np.array([i for i, _ in ends])
-    gap = position[None] - position[:, None]
-    distance = np.linalg.norm(gap, axis=2)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        towards = gap / distance[:, :, None]
+def _linked(pieces: _Pieces, max_gap: float, max_turn_deg: float) -> list[_Chain]:
+    """Chains of pieces, and whether each is taken from its last end.
+
+    Every end joins at most one other, the straightest and nearest continuation first.
+    """
+    position, outward = pieces.ends()
+    x, y = position.T
+    a, b = np.nonzero((x - x[:, None]) ** 2 + (y - y[:, None]) ** 2 < max_gap**2)
+    of_two = a // 2 < b // 2
+    a, b = a[of_two], b[of_two]
+    towards = position[b] - position[a]
+    distance = np.linalg.norm(towards, axis=1)
+    towards /= np.maximum(distance, 1e-9)[:, None]
     # Across a gap of a pixel or two its direction is noise: only the turn between the pieces counts.
-    far = distance > 4.0
-    turn = np.degrees(np.arccos(np.clip(-(outward @ outward.T), -1, 1)))
-    leave = np.degrees(np.arccos(np.clip(np.where(far, (outward[:, None] * towards).sum(axis=2), 1.0), -1, 1)))
-    worst = np.maximum(turn, np.maximum(leave, leave.T))
+    far = distance > _FAR_PX
+    cosines = np.stack(
+        [
+            -(outward[a] * outward[b]).sum(axis=1),
+            np.where(far, (outward[a] * towards).sum(axis=1), 1.0),
+            np.where(far, -(outward[b] * towards).sum(axis=1), 1.0),
+        ]
+    )
+    worst = np.degrees(np.arccos(np.clip(cosines.min(axis=0), -1, 1)))
     short = 12.0
     limit = np.where(
         distance < short,
         max_turn_deg,
         max_turn_deg / 3 + 2 * max_turn_deg / 3 * short / np.maximum(distance, short),
     )
-    cost = np.where(
-        (owner[:, None] != owner[None]) & (distance < max_gap) & (worst < limit),
-        distance / short + worst / max_turn_deg,
-        np.inf,
-    )
+    cost = distance / short + worst / max_turn_deg
     joined: dict[int, int] = {}
-    for flat in np.argsort(cost, axis=None, kind="stable"):
-        a, b = divmod(int(flat), len(ends))
-        if not np.isfinite(cost[a, b]):
-            break
-        if a not in joined and b not in joined:
-            joined[a], joined[b] = b, a
-    return _chains(pieces, joined)
+    order = np.argsort(cost, kind="stable")
+    for k in order[(worst < limit)[order]].tolist():
+        one, other = int(a[k]), int(b[k])
+        if one not in joined and other not in joined:
+            joined[one], joined[other] = other, one
+    return _chains(len(pieces.starts), joined)
 
 
-def _chains(pieces: list[_Piece], joined: dict[int, int]) -> list[list[_Piece]]:
+def _chains(count: int, joined: dict[int, int]) -> list[_Chain]:
     done: set[int] = set()
-    chains: list[list[_Piece]] = []
+    chains: list[_Chain] = []
     # Free ends first; what is left after them is closed loops, which are cut anywhere.
-    for start in sorted(range(2 * len(pieces)), key=lambda e: (e in joined, e)):
+    for start in sorted(range(2 * count), key=lambda e: (e in joined, e)):
         entry: int | None = start
-        chain: list[_Piece] = []
+        chain: _Chain = []
         while entry is not None and entry // 2 not in done:
             piece, which = divmod(entry, 2)
             done.add(piece)
-            chain.append(pieces[piece] if which == 0 else _Piece(pieces[piece].points[::-1], pieces[piece].width[::-1]))
+            chain.append((piece, which == 1))
             entry = joined.get(2 * piece + 1 - which)
         if chain:
             chains.append(chain)
     return chains
 
 
-def _centerline(chain: list[_Piece], reduction: int) -> Centerline:
-    points = np.concatenate([piece.points for piece in chain])
-    width = np.concatenate([piece.width for piece in chain])
-    return Centerline((points + 0.5) * reduction - 0.5, width * reduction)
+def _centerlines(pieces: _Pieces, chains: list[_Chain], reduction: int) -> list[Centerline]:
+    """The lines that chains of pieces are, in raw pixels, the longest first."""
+    if not chains:
+        return []
+    cuts = [
+        [np.arange(pieces.starts[piece], pieces.stops[piece])[:: -1 if turned else 1] for piece, turned in chain]
+        for chain in chains
+    ]
+    at = np.concatenate([cut for chain in cuts for cut in chain])
+    stops = np.cumsum([sum(map(len, chain)) for chain in cuts])
+    points, width = (pieces.points[at] + 0.5) * reduction - 0.5, pieces.width[at] * reduction
+    along = arc_length(points)
+    starts = np.concatenate([[0], stops[:-1]])
+    longest = np.argsort(along[starts] - along[stops - 1], kind="stable").tolist()
+    return [Centerline(points[starts[k] : stops[k]], width[starts[k] : stops[k]]) for k in longest]

@@ -23,6 +23,8 @@ from needletrack.tracking.stopwatch import Stopwatch
 # their log odds, over this length.
 _SPACING_MM = 2.5
 _SHOWN, _SHOWN_SHARE, _SHOWN_OVER_MM = 3.0, 0.6, 8.0
+# So many candidates, the best first, are looked at together.
+_TOGETHER = 4
 # Square of the cosine between curve and line of sight from which on it leaps.
 _LEAP = 0.75
 # What scores less than this share of the best is not worth a refinement.
@@ -60,11 +62,19 @@ def _judged(
     """The parts of the candidates that both views show as a needle, the best first."""
     wanted = parameters.match.max_candidates
     judged: list[Candidate] = []
-    for candidate in sorted(candidates, key=_at_best, reverse=True):
-        if len(judged) >= wanted and judged[wanted - 1].score >= _at_best(candidate):
-            break
-        judged.extend(_shown(candidate, images, rig, parameters))
+    waiting = sorted(candidates, key=_at_best, reverse=True)
+    while waiting:
+        curves_mm = [
+            initial_curve(each.points_mm, each.confidence, _SPACING_MM, parameters.fit) for each in waiting[:_TOGETHER]
+        ]
+        supports = silhouette_support(images, rig, curves_mm, parameters.needle)
+        for candidate, curve_mm, support in zip(waiting, curves_mm, supports, strict=False):
+            judged.extend(_shown(candidate, curve_mm, support, parameters.needle))
         judged.sort(key=lambda c: -c.score)
+        least = _LEAST_SHARE * judged[0].score if judged else 0.0
+        if len(judged) >= wanted:
+            least = max(least, judged[wanted - 1].score)
+        waiting = [each for each in waiting[_TOGETHER:] if _at_best(each) > least]
     return [each for each in judged[:wanted] if each.score >= _LEAST_SHARE * judged[0].score]
 
 
@@ -72,14 +82,12 @@ def _at_best(candidate: Candidate) -> float:
     return candidate.plausible * candidate.length_mm
 
 
-def _shown(candidate: Candidate, images: Images, rig: StereoRig, parameters: TrackingParameters) -> list[Candidate]:
+def _shown(candidate: Candidate, curve_mm: Float, support: Float, needle: Needle) -> list[Candidate]:
     """The parts of a candidate that both views show as a needle, scored by their length.
 
     What the two lines are of does not matter to their match; whether there is a silhouette of one diameter at that
-    depth in both views does.
+    depth in both views does: support (2, N), of the curve (N, 3) that it is.
     """
-    curve_mm = initial_curve(candidate.points_mm, candidate.confidence, _SPACING_MM, parameters.fit)
-    support = silhouette_support(images, rig, curve_mm, parameters.needle)
     spacing_mm = float(arc_length(curve_mm)[-1]) / (len(curve_mm) - 1)
     shown = (support > _SHOWN).mean(axis=0)
     along = tangents(curve_mm)
@@ -93,21 +101,22 @@ def _shown(candidate: Candidate, images: Images, rig: StereoRig, parameters: Tra
     parts = []
     for a, b in zip(edges[::2], edges[1::2], strict=True):
         chosen = (at >= a - 0.5) & (at <= b - 0.5)
-        if (b - a) * spacing_mm >= parameters.needle.min_length_mm / 2 and chosen.sum() >= 3:
+        if (b - a) * spacing_mm >= needle.min_length_mm / 2 and chosen.sum() >= 3:
             parts.append(candidate.part(chosen, candidate.plausible * float(shown[a:b].sum()) * spacing_mm))
     return parts
 
 
-def silhouette_support(images: Images, rig: StereoRig, points_mm: Float, needle: Needle) -> Float:
-    """Log Bayes factor (2, N) in each view of a needle about each point (N, 3) over none there.
+def silhouette_support(images: Images, rig: StereoRig, curves_mm: list[Float], needle: Needle) -> list[Float]:
+    """Log Bayes factor (2, N) in each view of a needle about each point of each curve (N, 3) over none there.
 
-    Of one diameter, blur of the lens and inside: those that explain most.
+    Of one diameter, blur of the lens and inside a curve: those that explain most.
     """
     views = [
         cut_sections(image, camera, local, needle).values
+        for curve_mm in curves_mm
         for image, camera, local in (
-            (images[0], rig.left, points_mm),
-            (images[1], rig.right, rig.right_from_left.apply(points_mm)),
+            (images[0], rig.left, curve_mm),
+            (images[1], rig.right, rig.right_from_left.apply(curve_mm)),
         )
     ]
     sections = products(np.concatenate(views))
@@ -115,11 +124,22 @@ def silhouette_support(images: Images, rig: StereoRig, points_mm: Float, needle:
     # Half way between a sharp lens and one nearly in focus; every fifth width is near enough.
     blur = 2
     widths = [i for i, w in enumerate(HALF_WIDTHS) if low <= w <= high][1::5]
-    none = log_evidence_of_no_needle(sections, blur)
-    tables = [
-        np.logaddexp.reduce(log_evidence(sections, Appearance(w, blur, inside), _NEAR), axis=1) - none
-        for w in widths
-        for inside in range(len(INSIDES))
-    ]
-    best = max(tables, key=lambda t: float(np.clip(t, -5.0, 20.0).sum()))
-    return np.asarray(best.reshape(2, -1))
+    tables = np.stack(
+        [
+            _anywhere(log_evidence(sections, Appearance(w, blur, inside), _NEAR))
+            for w in widths
+            for inside in range(len(INSIDES))
+        ]
+    )
+    tables -= log_evidence_of_no_needle(sections, blur)
+    says = np.clip(tables, -5.0, 20.0)
+    stops = np.cumsum([2 * len(curve_mm) for curve_mm in curves_mm])
+    starts = stops - [2 * len(curve_mm) for curve_mm in curves_mm]
+    best = np.add.reduceat(says, starts, axis=1).argmax(axis=0)
+    return [tables[k, a:b].reshape(2, -1) for k, a, b in zip(best, starts, stops, strict=True)]
+
+
+def _anywhere(log_evidence: Float) -> Float:
+    """Log evidence (N,) of one place or another, summed over all (N, S); `np.logaddexp` takes three times as long."""
+    most = log_evidence.max(axis=1)
+    return np.asarray(most + np.log(np.exp(log_evidence - most[:, None]).sum(axis=1)))

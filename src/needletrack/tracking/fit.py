@@ -24,6 +24,8 @@ from needletrack.tracking.needle import Positive
 
 # Points triangulated from two skeletons scatter by about this much.
 _SKELETON_SIGMA_MM = 0.3
+# Points this far off a rough curve count half.
+_LEAST_ROUGHNESS_MM = 0.3
 # Sigmas by which a streak's places may be off its line before they count for less.
 ROBUST_SIGMAS = 2.0
 # Points of the curve may slide along it by so much.
@@ -110,19 +112,25 @@ def initial_curve(points_mm: Float, confidence: Float, spacing_mm: float, parame
     # Noise makes a zigzag of triangulated points longer than the needle; a coarse resampling measures it.
     coarse_mm = float(arc_length(resample(points_mm, max(4, len(points_mm) // 6)))[-1])
     count = _control_count(coarse_mm, parameters)
-    u = length / length[-1]
-    b = basis(u, count)
-    weight = np.asarray(confidence, dtype=np.float64) ** 2
-    third = _third_derivative(count) / coarse_mm**3
-    stiffness = (_SKELETON_SIGMA_MM / parameters.curvature_change_per_mm2) ** 2 * third.T @ third
-    control: npt.NDArray[np.floating] = points_mm[[0]].repeat(count, axis=0)
-    for _ in range(5):
-        normal = b.T @ (weight[:, None] * b) + stiffness + 1e-9 * np.eye(count)
-        control = np.linalg.solve(normal, b.T @ (weight[:, None] * points_mm))
-        error = np.linalg.norm(b @ control - points_mm, axis=1)
-        scale = max(0.3, 1.5 * float(np.median(error)))
-        weight = np.asarray(confidence, dtype=np.float64) ** 2 / (1 + (error / scale) ** 2)
-    dense = basis(np.linspace(0, 1, 400), count) @ control
+    near = spline_basis(length / length[-1], count)
+    stiffness = (_SKELETON_SIGMA_MM / parameters.curvature_change_per_mm2 / coarse_mm**3) ** 2 * _stiffness(count)
+    stiffness[:, 0] += 1e-9
+    control = np.empty((count, 3))
+    call(
+        "rough_curve",
+        np.ascontiguousarray(points_mm, dtype=np.float64),
+        np.ascontiguousarray(confidence, dtype=np.float64),
+        len(points_mm),
+        count,
+        near.first,
+        near.mixing,
+        stiffness,
+        5,
+        _LEAST_ROUGHNESS_MM,
+        np.empty(4 * count + 2 * len(points_mm)),
+        control,
+    )
+    dense = _dense_basis(count) @ control
     return resample(dense, max(8, round(float(arc_length(dense)[-1]) / spacing_mm) + 1))
 
 
@@ -436,6 +444,19 @@ def _control_count(length_mm: float, parameters: FitParameters) -> int:
 def _third_derivative(count: int) -> Float:
     middles = (np.arange(count - 3) + 0.5) / (count - 3)
     return basis(middles, count, derivative=3)
+
+
+@lru_cache(maxsize=64)
+def _stiffness(count: int) -> Float:
+    """The cost of a change of curvature by control points, its diagonal and the three beside it (count, 4)."""
+    third = _third_derivative(count)
+    dense = third.T @ third
+    return np.stack([np.pad(np.diagonal(dense, k), (0, k)) for k in range(4)], axis=1)
+
+
+@lru_cache(maxsize=64)
+def _dense_basis(count: int) -> Float:
+    return basis(np.linspace(0, 1, 400), count)
 
 
 def priors(parameters: FitParameters) -> Float:

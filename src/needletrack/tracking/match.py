@@ -8,6 +8,7 @@ whole are matched by their ends.
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
@@ -15,11 +16,11 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from needletrack.errors import NeedleNotFound
 from needletrack.geometry.camera import Camera
-from needletrack.geometry.epipolar import epipolar_distance_map_px, homogeneous
+from needletrack.geometry.epipolar import epipolar_distance_map_px, epipolar_lines
 from needletrack.geometry.spline import arc_length
 from needletrack.geometry.stereo import StereoRig
-from needletrack.geometry.triangulation import triangulate
-from needletrack.records import Centerline, Correspondences, Float, Reason
+from needletrack.kernels import call
+from needletrack.records import Centerline, Correspondences, Float, Int, Reason
 from needletrack.tracking.needle import Needle, Positive, Range, Workspace
 
 
@@ -38,8 +39,12 @@ class MatchParameters(BaseModel):
 # Along the needle, a step in space is at most so many times the step that the left view shows: turned 70 degrees away.
 _MAX_FORESHORTENING = 3.0
 _COARSE_STRIDE = 4
+# Points along the lines are no closer than this far away.
+_LEAST_STEP_MM = 0.85
 # Scenes with vessels have up to 100 pairs; a pattern of stripes has thousands, and none of them is a needle.
 _MAX_PAIRS = 150
+# Room for crossings to begin with.
+_USUAL_CROSSINGS = 20_000
 # So many are offered; which of them the images support is told later.
 _MAX_CANDIDATES = 12
 # Lines run along the epipolar lines where the sine of the angle is below this.
@@ -101,26 +106,32 @@ def match_lines(
     """Candidates for the needle, the best supported one first; raises NeedleNotFound where there is none."""
     if not left or not right:
         raise NeedleNotFound("match", Reason.NO_CANDIDATE)
-    left_px = [_resampled(line, rig.left, parameters.step_px) for line in left]
-    right_px = [_resampled(line, rig.right, parameters.step_px) for line in right]
-    pairs = _pairs(left_px, right_px, rig, workspace, parameters)
-    found: list[Candidate] = []
-    crossing_mm: dict[tuple[int, int], float] = {}
-    for i, j, own in pairs.within:
-        chain = _best_chain(_crossings(left_px[i], right_px[j], rig, workspace), rig, parameters)
-        if chain is not None:
-            candidate = _candidate(left[i], right[j], chain, own)
-            found.append(candidate)
-            if np.median(candidate.confidence) > _LENGTHWISE / 2:
-                crossing_mm[i, j] = candidate.length_mm
-    for i, j, chain in _lengthwise(left_px, right_px, rig, workspace):
-        candidate = _candidate(left[i], right[j], chain, 1.0)
-        if candidate.length_mm > _LENGTHENS * crossing_mm.get((i, j), 0.0):
-            found.append(candidate)
-    found = [candidate for candidate in found if candidate.length_mm >= needle.min_length_mm / 2]
-    if not found:
+    # Lines of large images were traced on reduced ones: more points than that tell nothing new.
+    step_px = max(parameters.step_px, _LEAST_STEP_MM * rig.left.focal_px / workspace.z_mm.max)
+    views = _Views(_resampled(left, rig.left, step_px), _resampled(right, rig.right, step_px), rig, workspace)
+    pairs = _pairs(views, parameters)
+    least_mm = needle.min_length_mm / 2
+    shape = len(left), len(right)
+    own, crossing_mm = np.ones(shape), np.zeros(shape)
+    own[tuple(pairs.within.T)] = pairs.own
+    found = _crossings(views, views.left, pairs.within, workspace)
+    chains = _best_chains(found, pairs.within, views.rig, parameters)
+    offered = _offers(chains, own[tuple(chains.lines.T)], chains.lengths_mm >= least_mm)
+    for offer in offered:
+        if np.median(offer.chain.crossings.sine) > _LENGTHWISE / 2:
+            crossing_mm[offer.left, offer.right] = offer.length_mm
+    along = _lengthwise(views)
+    longer = along.lengths_mm > _LENGTHENS * crossing_mm[tuple(along.lines.T)]
+    offered += _offers(along, np.ones(len(along)), longer & (along.lengths_mm >= least_mm))
+    if not offered:
         raise NeedleNotFound("match", Reason.OUTSIDE_WORKSPACE if pairs.elsewhere else Reason.NO_STEREO_MATCH)
-    return sorted(found, key=lambda c: -c.score)[:_MAX_CANDIDATES]
+    best: list[Candidate] = []
+    for offer in sorted(offered, key=lambda o: -o.at_best):
+        if len(best) == _MAX_CANDIDATES and offer.at_best <= best[-1].score:
+            break
+        best.append(_candidate(left[offer.left], right[offer.right], offer))
+        best = sorted(best, key=lambda c: -c.score)[:_MAX_CANDIDATES]
+    return best
 
 
 def inside(workspace: Workspace, points_mm: Float) -> npt.NDArray[np.bool_]:
@@ -130,10 +141,85 @@ def inside(workspace: Workspace, points_mm: Float) -> npt.NDArray[np.bool_]:
     return np.asarray(((points_mm >= lower) & (points_mm <= upper)).all(axis=1), dtype=np.bool_)
 
 
-def _resampled(line: Centerline, camera: Camera, step_px: float) -> Float:
-    length = arc_length(line.points_px)
-    at = np.linspace(0.0, length[-1], max(2, round(length[-1] / step_px) + 1))
-    return camera.undistort(np.column_stack([np.interp(at, length, column) for column in line.points_px.T]))
+@dataclass(frozen=True, eq=False)
+class _Lines:
+    """Lines of one view, one behind the other: undistorted points (N, 2), each from a start to before a stop (L,)."""
+
+    points_px: Float
+    starts: Int
+    stops: Int
+
+    def __len__(self) -> int:
+        return len(self.starts)
+
+    def ends_px(self) -> Float:
+        """First and last point of each, (L, 2, 2)."""
+        return self.points_px[np.stack([self.starts, self.stops - 1], axis=1)]
+
+    def sparse(self) -> "_Lines":
+        """Every fourth point of those that are long enough for it."""
+        count = self.stops - self.starts
+        stride = np.where(count > 4 * _COARSE_STRIDE, _COARSE_STRIDE, 1)
+        at = np.arange(len(self.points_px)) - np.repeat(self.starts, count)
+        stops = np.cumsum(-(-count // stride))
+        return _Lines(
+            self.points_px[at % np.repeat(stride, count) == 0],
+            np.concatenate([[0], stops[:-1]]).astype(np.int64),
+            stops,
+        )
+
+
+def _starts(stops: Int) -> Int:
+    """Where each of several begins (P,) that lie one behind the other, from where they stop."""
+    return np.concatenate([[0], stops]).astype(np.int64)[: len(stops)]
+
+
+def _resampled(lines: list[Centerline], camera: Camera, step_px: float) -> _Lines:
+    """Points along each line, evenly spaced by about so much."""
+    points = np.concatenate([line.points_px for line in lines])
+    given = np.cumsum([len(line.points_px) for line in lines])
+    step = np.linalg.norm(np.diff(points, axis=0), axis=1)
+    # Along all lines as if they were one, with a step of one from each to the next: a single interpolation serves all.
+    step[given[:-1] - 1] = 1.0
+    along = np.concatenate([[0.0], np.cumsum(step)])
+    first, last = along[np.concatenate([[0], given[:-1]])], along[given - 1]
+    count = np.maximum(2, np.rint((last - first) / step_px).astype(np.int64) + 1)
+    stops = np.cumsum(count)
+    starts = stops - count
+    share = (np.arange(stops[-1]) - np.repeat(starts, count)) / np.repeat(count - 1, count)
+    at = np.repeat(first, count) + share * np.repeat(last - first, count)
+    return _Lines(
+        camera.undistort(np.column_stack([np.interp(at, along, column) for column in points.T])), starts, stops
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _Views:
+    """All lines of both views, and the rig that sees them."""
+
+    left: _Lines
+    right: _Lines
+    rig: StereoRig
+    workspace: Workspace
+
+    def ranges(self, left: _Lines, pairs: Int) -> Int:
+        """Where the left and the right line of each pair start and stop, (P, 4), as the kernels take them."""
+        i, j = pairs.T
+        return np.column_stack([left.starts[i], left.stops[i], self.right.starts[j], self.right.stops[j]])
+
+    @cached_property
+    def packed_rig(self) -> Float:
+        """As the kernels take it."""
+        pose = self.rig.right_from_left
+        return np.concatenate(
+            [
+                self.rig.fundamental.ravel(),
+                np.linalg.inv(self.rig.left.matrix).ravel(),
+                np.linalg.inv(self.rig.right.matrix).ravel(),
+                pose.rotation.T.ravel(),
+                -pose.rotation.T @ pose.translation_mm,
+            ]
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -147,7 +233,11 @@ class _Crossings:
     points_mm: Float
     sine: Float
 
-    def take(self, index: npt.NDArray[np.int64] | npt.NDArray[np.bool_]) -> "_Crossings":
+    @property
+    def arrays(self) -> tuple[Int, Float, Float, Float, Float, Float]:
+        return self.left_at, self.right_at, self.left_px, self.right_px, self.points_mm, self.sine
+
+    def take(self, index: Int | npt.NDArray[np.bool_] | slice) -> "_Crossings":
         return _Crossings(
             self.left_at[index],
             self.right_at[index],
@@ -164,244 +254,316 @@ class _Chain:
     score: float
 
 
-def _crossings(left_px: Float, right_px: Float, rig: StereoRig, box: Workspace) -> _Crossings:
-    distance = epipolar_distance_map_px(rig.fundamental, left_px, right_px)
-    index, before = np.nonzero((distance[:, :-1] < 0) != (distance[:, 1:] < 0))
-    near, far = distance[index, before], distance[index, before + 1]
-    fraction = near / (near - far)
-    step = right_px[before + 1] - right_px[before]
-    crossing_px = right_px[before] + fraction[:, None] * step
-    points = triangulate(rig, left_px[index], crossing_px)
-    sine = np.abs(far - near) / np.maximum(np.linalg.norm(step, axis=1), 1e-9)
-    found = _Crossings(index, before + fraction, left_px[index], crossing_px, points, sine)
-    return found.take(inside(box, points))
+@dataclass(frozen=True, eq=False)
+class _Found:
+    """Crossings of several pairs of lines, each pair's from a start to before a stop (P,), by left point."""
+
+    crossings: _Crossings
+    starts: Int
+    stops: Int
+
+    def within(self, chosen: npt.NDArray[np.bool_]) -> "_Found":
+        """The chosen crossings alone."""
+        before = np.concatenate([[0], np.cumsum(chosen)])
+        return _Found(self.crossings.take(chosen), before[self.starts], before[self.stops])
+
+    def of(self, pairs: Int) -> "_Found":
+        """Of these pairs alone."""
+        return _Found(self.crossings, self.starts[pairs], self.stops[pairs])
+
+
+def _corners(box: Workspace) -> Float:
+    """Lowest and highest corner, (6,), mm."""
+    ranges = (box.x_mm, box.y_mm, box.z_mm)
+    return np.array([r.min for r in ranges] + [r.max for r in ranges])
+
+
+def _crossings(views: _Views, left: _Lines, pairs: Int, box: Workspace) -> _Found:
+    """Where the epipolar lines of left points cross right lines, in the box, for pairs of lines (P, 2)."""
+    ranges = views.ranges(left, pairs)
+    ends = np.zeros(len(ranges), np.int64)
+    distance = np.empty(len(views.right.points_px))
+    lines = epipolar_lines(views.rig.fundamental, left.points_px)
+    given = views.packed_rig, left.points_px, lines, views.right.points_px, ranges, len(ranges), _corners(box)
+    capacity = _USUAL_CROSSINGS
+    while True:
+        room = _Crossings(
+            np.empty(capacity, np.int64),
+            np.empty(capacity),
+            np.empty((capacity, 2)),
+            np.empty((capacity, 2)),
+            np.empty((capacity, 3)),
+            np.empty(capacity),
+        )
+        count = call("crossings", *given, capacity, distance, *room.arrays, ends)
+        if count <= capacity:
+            return _Found(room.take(slice(count)), _starts(ends), ends)
+        capacity = count
+
+
+@dataclass(frozen=True, eq=False)
+class _Chains:
+    """Chains of crossings, the best first: their lines (C, 2), each from a start to before a stop (C,), scores (C,)."""
+
+    crossings: _Crossings
+    lines: Int
+    starts: Int
+    stops: Int
+    scores: Float
+
+    def __len__(self) -> int:
+        return len(self.scores)
+
+    def chain(self, index: int) -> _Chain:
+        """One of them."""
+        cut = slice(int(self.starts[index]), int(self.stops[index]))
+        return _Chain(self.crossings.take(cut), float(self.scores[index]))
+
+    def means(self, values: Float) -> Float:
+        """The mean (C,) along each chain of values (N,) of the crossings."""
+        total = np.concatenate([[0.0], np.cumsum(values)])
+        return np.asarray((total[self.stops] - total[self.starts]) / (self.stops - self.starts))
+
+    @cached_property
+    def lengths_mm(self) -> Float:
+        """Length (C,) of each in space."""
+        along = arc_length(self.crossings.points_mm)
+        return along[self.stops - 1] - along[self.starts]
+
+    @cached_property
+    def places(self) -> Float:
+        """Places (2, N) on the left and on the right lines."""
+        return np.stack([self.crossings.left_at, self.crossings.right_at])
+
+    @cached_property
+    def reach(self) -> tuple[Float, Float]:
+        """Lowest and highest place (2, C) of each."""
+        order = np.argsort(self.starts)
+        back = np.argsort(order)
+        low, high = (
+            extreme.reduceat(self.places, self.starts[order], axis=1)[:, back] if len(self) else np.zeros((2, 0))
+            for extreme in (np.minimum, np.maximum)
+        )
+        return np.ascontiguousarray(low), np.ascontiguousarray(high)
+
+    def gone(self, workspace: Workspace) -> Int:
+        """Those that are each other's best partners, outside the workspace."""
+        is_outside = self.means(inside(workspace, self.crossings.points_mm).astype(np.float64)) <= 0.5
+        gone = np.empty(len(self), np.int64)
+        lost = call(
+            "gone_elsewhere",
+            np.ascontiguousarray(self.lines.T),
+            self.places,
+            self.places.shape[1],
+            self.starts,
+            self.stops,
+            *self.reach,
+            is_outside,
+            len(self),
+            np.empty(len(self), np.int64),
+            gone,
+        )
+        return gone[:lost]
+
+    def shares(self, others: "_Chains", gone: Int) -> Float:
+        """How much of each chain's left and right stretch (C, 2) is taken by the others that are gone."""
+        shares = np.zeros((2, len(self)))
+        call(
+            "shares_gone",
+            np.ascontiguousarray(self.lines.T),
+            self.places,
+            self.places.shape[1],
+            self.starts,
+            self.stops,
+            len(self),
+            np.ascontiguousarray(others.lines[gone].T),
+            *(np.ascontiguousarray(reach[:, gone]) for reach in others.reach),
+            len(gone),
+            np.empty(len(gone), np.int64),
+            shares,
+        )
+        return shares.T
+
+
+def _best_chains(found: _Found, lines: Int, rig: StereoRig, parameters: MatchParameters) -> _Chains:
+    """Of each pair of lines (P, 2) that has one the longest chain that keeps order and leaps nowhere.
+
+    The right line may be taken either way.
+    """
+    at, groups = found.crossings, len(found.starts)
+    most = int((found.stops - found.starts).max(initial=0))
+    chosen, ends, scores = np.empty(len(at.left_at), np.int64), np.empty(groups, np.int64), np.empty(groups)
+    call(
+        "best_chains",
+        at.left_at,
+        at.right_at,
+        at.left_px,
+        at.points_mm,
+        at.sine,
+        found.starts,
+        found.stops,
+        groups,
+        rig.left.focal_px,
+        _MAX_FORESHORTENING,
+        parameters.max_gap_mm,
+        np.empty(2 * most),
+        np.empty(2 * most, np.int64),
+        chosen,
+        ends,
+        scores,
+    )
+    return _ordered(at.take(chosen[: ends.max(initial=0)]), ends, lines, scores)
+
+
+def _ordered(crossings: _Crossings, ends: Int, lines: Int, scores: Float) -> _Chains:
+    """Chains that lie one behind the other, some of them of no length."""
+    starts = _starts(ends)
+    order = np.argsort(-scores, kind="stable")
+    order = order[ends[order] > starts[order]]
+    return _Chains(crossings, lines[order], starts[order], ends[order], scores[order])
 
 
 @dataclass(frozen=True, slots=True)
 class _Pairs:
-    """Lines that may be one needle within the workspace, and how many are each other's best partners elsewhere.
+    """Lines that may be one needle within the workspace, (P, 2), and how many are each other's best partners elsewhere.
 
-    With each pair comes the share of its stretches that has no better partner elsewhere.
+    own (P,): the share of their stretches that has no better partner elsewhere.
     """
 
-    within: list[tuple[int, int, float]]
+    within: Int
+    own: Float
     elsewhere: int
 
 
-def _pairs(
-    left: list[Float], right: list[Float], rig: StereoRig, workspace: Workspace, parameters: MatchParameters
-) -> _Pairs:
+def _pairs(views: _Views, parameters: MatchParameters) -> _Pairs:
     """Pairs of lines that meet in the workspace, but for those that both have their best partners elsewhere.
 
     Within the workspace a line is offered with every partner: a needle in front of a vessel, or seen as two rims and a
     streak, has its own among them. What lies elsewhere is exclusive.
     """
+    workspace = views.workspace
     nearest, furthest = workspace.z_mm.min * _DEPTH_MARGIN[0], workspace.z_mm.max * _DEPTH_MARGIN[1]
     everywhere = Range(min=-furthest, max=furthest)
     anywhere = Workspace(x_mm=everywhere, y_mm=everywhere, z_mm=Range(min=nearest, max=furthest))
-    sparse = [points[:: _COARSE_STRIDE if len(points) > 4 * _COARSE_STRIDE else 1] for points in left]
-    chains, chains_within = [], []
-    for i, j in _promising(sparse, right, rig, anywhere):
-        crossings = _crossings(sparse[i], right[j], rig, anywhere)
-        is_within = inside(workspace, crossings.points_mm)
-        chain = _best_chain(crossings, rig, parameters)
-        if chain is not None:
-            chains.append((i, j, chain))
-        if not is_within.all():
-            chain = _best_chain(crossings.take(is_within), rig, parameters)
-        if chain is not None:
-            chains_within.append((i, j, chain))
-    taken, gone = (_Taken({}, {}), _Taken({}, {}))
-    elsewhere = 0
-    for i, j, chain in sorted(chains, key=lambda c: -c[2].score):
-        if max(taken.shares(i, j, chain)) > 0.5:
-            continue
-        taken.add(i, j, chain)
-        if np.mean(inside(workspace, chain.crossings.points_mm)) <= 0.5:
-            gone.add(i, j, chain)
-            elsewhere += 1
-    within = []
-    for i, j, chain in chains_within:
-        shares = gone.shares(i, j, chain)
-        if min(shares) <= 0.5:
-            within.append((i, j, 1 - float(np.mean(shares))))
-    return _Pairs(within, elsewhere)
+    sparse = views.left.sparse()
+    lines = np.indices((len(sparse), len(views.right))).reshape(2, -1).T
+    found = _crossings(views, sparse, lines, anywhere)
+    promising = _promising(found)
+    found = found.of(promising)
+    chains = _best_chains(found, lines[promising], views.rig, parameters)
+    is_within = inside(workspace, found.crossings.points_mm)
+    within = _best_chains(found.within(is_within), lines[promising], views.rig, parameters)
+    gone = chains.gone(workspace)
+    shares = within.shares(chains, gone)
+    kept = shares.min(axis=1, initial=1.0) <= 0.5
+    return _Pairs(within.lines[kept], 1 - shares[kept].mean(axis=1), len(gone))
 
 
-_Place = tuple[dict[int, list[tuple[float, float]]], int, Float]
+def _promising(found: _Found) -> Int:
+    """The pairs of lines of which at least three left points have a crossing, the most crossings first."""
+    at = found.crossings.left_at
+    owner = np.repeat(np.arange(len(found.starts)), found.stops - found.starts)
+    is_new = np.ones(len(at), np.bool_)
+    is_new[1:] = (at[1:] != at[:-1]) | (owner[1:] != owner[:-1])
+    votes = np.bincount(owner[is_new], minlength=len(found.starts))
+    most = np.argsort(-votes, kind="stable")[:_MAX_PAIRS]
+    return most[votes[most] >= 3]
 
 
 @dataclass(frozen=True, slots=True)
-class _Taken:
-    """Stretches, as first and last index, of left and right lines that have found a partner."""
+class _Offer:
+    """A chain of a left and a right line, of which `own` is not better matched elsewhere."""
 
-    left: dict[int, list[tuple[float, float]]]
-    right: dict[int, list[tuple[float, float]]]
+    left: int
+    right: int
+    chain: _Chain
+    own: float
+    length_mm: float
 
-    def add(self, i: int, j: int, chain: _Chain) -> None:
-        for lines, line, at in self._places(i, j, chain):
-            lines.setdefault(line, []).append((float(at.min()), float(at.max())))
-
-    def shares(self, i: int, j: int, chain: _Chain) -> tuple[float, float]:
-        """How much of the chain's left and of its right stretch is taken."""
-        left, right = (
-            float(np.mean(np.any([(at >= a) & (at <= b) for a, b in lines.get(line, [(1.0, 0.0)])], axis=0)))
-            for lines, line, at in self._places(i, j, chain)
-        )
-        return left, right
-
-    def _places(self, i: int, j: int, chain: _Chain) -> tuple[_Place, _Place]:
-        at = chain.crossings
-        return (self.left, i, at.left_at.astype(np.float64)), (self.right, j, at.right_at)
+    @property
+    def at_best(self) -> float:
+        """What it may be ranked by."""
+        return self.own * self.chain.score
 
 
-def _promising(left: list[Float], right: list[Float], rig: StereoRig, box: Workspace) -> list[tuple[int, int]]:
-    """Pairs of lines of which at least three left points have a crossing in the box, the most crossings first."""
-    left_owner = np.repeat(np.arange(len(left)), [len(p) for p in left])
-    right_owner = np.repeat(np.arange(len(right)), [len(p) for p in right])
-    found = _crossings(np.concatenate(left), np.concatenate(right), rig, box)
-    before = found.right_at.astype(np.int64)
-    within = right_owner[before] == right_owner[np.minimum(before + 1, len(right_owner) - 1)]
-    rows = np.unique(np.column_stack([found.left_at, right_owner[before]])[within], axis=0)
-    votes = np.zeros((len(left), len(right)), np.int64)
-    np.add.at(votes, (left_owner[rows[:, 0]], rows[:, 1]), 1)
-    most = np.argsort(-votes, axis=None, kind="stable")[:_MAX_PAIRS]
-    return [(int(i), int(j)) for i, j in zip(*np.unravel_index(most, votes.shape), strict=True) if votes[i, j] >= 3]
+def _offers(chains: _Chains, own: Float, chosen: npt.NDArray[np.bool_]) -> list[_Offer]:
+    return [
+        _Offer(int(i), int(j), chains.chain(k), float(own[k]), float(chains.lengths_mm[k]))
+        for k, (i, j) in enumerate(chains.lines)
+        if chosen[k]
+    ]
 
 
-def _candidate(left: Centerline, right: Centerline, chain: _Chain, own: float) -> Candidate:
-    found = chain.crossings
+def _candidate(left: Centerline, right: Centerline, offer: _Offer) -> Candidate:
+    found = offer.chain.crossings
     forward = found.right_at[-1] > found.right_at[0]
-    length_mm = float(arc_length(found.points_mm)[-1])
     # The length across the line of sight: depth that changes without reason makes a curve long.
     towards = found.points_mm / np.linalg.norm(found.points_mm, axis=1, keepdims=True)
     step = np.diff(found.points_mm[:: max(1, len(found.points_mm) // 10)], axis=0)
     depth = (step * towards[: len(step)]).sum(axis=1)
     across = 1 - float((depth**2).sum() / max((step**2).sum(), 1e-12))
-    plausible = own * across
+    plausible = offer.own * across
     return Candidate(
         left,
         right if forward else right.reversed(),
         Correspondences(found.left_px, found.right_px),
         found.points_mm,
         found.sine,
-        length_mm,
-        plausible * chain.score,
+        offer.length_mm,
+        plausible * offer.chain.score,
         plausible,
     )
 
 
-def _lengthwise(
-    left: list[Float], right: list[Float], rig: StereoRig, workspace: Workspace
-) -> list[tuple[int, int, _Chain]]:
+def _lengthwise(views: _Views) -> _Chains:
     """Pairs of lines that run mostly along the epipolar lines, matched by their ends and by how they bend.
 
     The inverse depth along the left line is a polynomial that brings it onto the right line, with its ends near the
     right line's ends: where the lines do not cross the epipolar lines, the ends alone fix the depth.
     """
-    ends_left, ends_right = (np.concatenate([points[[0, -1]] for points in lines]) for lines in (left, right))
-    apart = epipolar_distance_map_px(rig.fundamental, ends_left, ends_right).reshape(len(left), 2, len(right), 2)
-    chord = np.linalg.norm(ends_right[1::2] - ends_right[::2], axis=1)
+    ends_left, ends_right = views.left.ends_px(), views.right.ends_px()
+    apart = epipolar_distance_map_px(views.rig.fundamental, ends_left.reshape(-1, 2), ends_right.reshape(-1, 2))
+    apart = apart.reshape(len(views.left), 2, len(views.right), 2)
+    chord = np.linalg.norm(ends_right[:, 1] - ends_right[:, 0], axis=1)
     is_along = np.abs(apart[..., 1] - apart[..., 0]).max(axis=1) < _LENGTHWISE * chord
-    found = []
-    for turned in (False, True):
+    pairs, turned = [], []
+    for is_turned in (False, True):
         # First end to first end, or to the last one.
-        ends = np.stack([apart[:, 0, :, int(turned)], apart[:, 1, :, 1 - int(turned)]])
-        for i, j in zip(*np.nonzero(is_along & (np.abs(ends).max(axis=0) < _MAX_ENDS_APART_PX)), strict=True):
-            chain = _by_ends(left[i], right[j][::-1] if turned else right[j], rig, workspace)
-            if chain is not None:
-                found.append((int(i), int(j), chain))
-    return found
+        ends = np.stack([apart[:, 0, :, int(is_turned)], apart[:, 1, :, 1 - int(is_turned)]])
+        pairs.append(np.argwhere(is_along & (np.abs(ends).max(axis=0) < _MAX_ENDS_APART_PX)))
+        turned.append(np.full(len(pairs[-1]), is_turned))
+    return _by_ends(views, np.concatenate(pairs), np.concatenate(turned))
 
 
-def _by_ends(left_px: Float, right_px: Float, rig: StereoRig, workspace: Workspace) -> _Chain | None:
-    """The left line at the depth that brings it onto the right line, both in the same order; None: not in the box."""
-    ends_mm = triangulate(rig, left_px[[0, -1]], right_px[[0, -1]])
-    # Ends are traced too short or too long: the start may lie somewhat outside.
-    if not ((ends_mm[:, 2] > workspace.z_mm.min / 1.5) & (ends_mm[:, 2] < workspace.z_mm.max * 1.5)).all():
-        return None
-    rays = homogeneous(left_px) @ np.linalg.inv(rig.left.matrix).T
-    pose = rig.right_from_left
-    # A point of the left line at inverse depth q projects to far + q * near, homogeneous.
-    far = rays @ pose.rotation.T @ rig.right.matrix.T
-    near = rig.right.matrix @ pose.translation_mm
-    s = np.linspace(-1.0, 1.0, len(left_px))
-    design = np.polynomial.legendre.legvander(s, 3)
-    first, last = 1 / ends_mm[:, 2]
-    coefficients = np.array([(first + last) / 2, (last - first) / 2, 0.0, 0.0])
-    prior = np.diag(_BEND_PRIOR)
-    segments = np.diff(right_px, axis=0)
-    length = np.maximum(np.linalg.norm(segments, axis=1), 1e-9)
-    along = segments / length[:, None]
-    normal = np.column_stack([-along[:, 1], along[:, 0]])
-
-    def at(c: Float) -> tuple[Float, Float]:
-        q = design @ c
-        h = far + q[:, None] * near
-        px = h[:, :2] / h[:, 2:]
-        return px, (near[:2] - px * near[2]) / h[:, 2:]
-
-    for _ in range(5):
-        px, by_q = at(coefficients)
-        nearest = np.linalg.norm(px[:, None] - (right_px[:-1] + segments / 2), axis=2).argmin(axis=1)
-        across = ((right_px[nearest] - px) * normal[nearest]).sum(axis=1)
-        rows = design * (by_q * normal[nearest]).sum(axis=1)[:, None]
-        ends = ((right_px[[0, -1]] - px[[0, -1]]) * along[[0, -1]]).sum(axis=1)
-        end_rows = design[[0, -1]] * (by_q[[0, -1]] * along[[0, -1]]).sum(axis=1)[:, None]
-        residual = np.concatenate([across / _ACROSS_PX, ends / _ENDS_PX])
-        matrix = np.concatenate([rows / _ACROSS_PX, end_rows / _ENDS_PX])
-        weight = 1 / (1 + residual**2)
-        normal_matrix = matrix.T @ (weight[:, None] * matrix) + prior
-        coefficients = coefficients + np.linalg.solve(
-            normal_matrix, matrix.T @ (weight * residual) - prior @ coefficients
-        )
-    px, _ = at(coefficients)
-    points_mm = rays / (design @ coefficients)[:, None]
-    nearest = np.linalg.norm(px[:, None] - right_px, axis=2).argmin(axis=1)
-    offset = np.linalg.norm(px - right_px[nearest], axis=1)
-    good = inside(workspace, points_mm) & (offset < 2 * length.max())
-    if good.sum() < 3:
-        return None
-    index = np.flatnonzero(good)
-    crossings = _Crossings(
-        index, nearest[index].astype(np.float64), left_px[index], px[index], points_mm[index], np.ones(len(index))
+def _by_ends(views: _Views, pairs: Int, turned: npt.NDArray[np.bool_]) -> _Chains:
+    """The left lines at the depth that brings them onto the right ones, some turned round, where that is in the box."""
+    ranges = views.ranges(views.left, pairs)
+    count = int((ranges[:, 1] - ranges[:, 0]).sum())
+    z_mm, pose = views.workspace.z_mm, views.rig.right_from_left
+    limits = np.array([_ACROSS_PX, _ENDS_PX, *_BEND_PRIOR, z_mm.min, z_mm.max, *_corners(views.workspace)])
+    at, nearest, ends = np.empty(count, np.int64), np.empty(count), np.empty(len(pairs), np.int64)
+    right_px, points_mm = np.empty((count, 2)), np.empty((count, 3))
+    call(
+        "by_ends",
+        views.packed_rig,
+        np.ascontiguousarray(views.rig.right.matrix),
+        np.ascontiguousarray(pose.rotation),
+        np.ascontiguousarray(pose.translation_mm),
+        views.left.points_px,
+        views.right.points_px,
+        ranges,
+        turned,
+        len(pairs),
+        limits,
+        np.empty(6 * len(views.left.points_px) + 2 * len(views.right.points_px)),
+        at,
+        nearest,
+        right_px,
+        points_mm,
+        ends,
     )
-    return _Chain(crossings, float(len(index)) * _LENGTHWISE)
-
-
-def _best_chain(found: _Crossings, rig: StereoRig, parameters: MatchParameters) -> _Chain | None:
-    """The longest chain of crossings, the right line taken either way, that keeps order and leaps nowhere in space."""
-    if len(found.left_at) < 3:
-        return None
-    leap = np.linalg.norm(found.points_mm[None] - found.points_mm[:, None], axis=2)
-    shown_px = np.linalg.norm(found.left_px[None] - found.left_px[:, None], axis=2)
-    shown_mm = shown_px * found.points_mm[:, 2] / rig.left.focal_px
-    possible = (leap < _MAX_FORESHORTENING * shown_mm) & (shown_mm < parameters.max_gap_mm)
-    possible &= found.left_at[None] > found.left_at[:, None]
-    # What a step costs: the left points that it skips, and the depth that it gains for nothing seen.
-    stride = max(1, int(np.min(np.diff(np.unique(found.left_at)), initial=1)))
-    skipped = (found.left_at[None] - found.left_at[:, None]) / stride - 1
-    with np.errstate(divide="ignore", invalid="ignore"):
-        cost = np.where(possible, 0.2 * skipped + 0.3 * (leap / shown_mm - 1), np.inf)
-    ways = [_follow(found, cost, turn) for turn in (1.0, -1.0)]
-    best, score = max(ways, key=lambda way: way[1])
-    return _Chain(found.take(best), score) if len(best) >= 3 else None
-
-
-def _follow(found: _Crossings, cost: Float, turn: float) -> tuple[npt.NDArray[np.int64], float]:
-    at = turn * found.right_at
-    ordered_cost = np.where(at[None] > at[:, None], cost, np.inf)
-    # A crossing counts by how well it fixes the depth.
-    worth = found.sine + 0.05
-    score = worth.copy()
-    previous = np.full(len(at), -1)
-    for k in np.argsort(found.left_at, kind="stable"):
-        gain = score - ordered_cost[:, k]
-        best = int(np.argmax(gain))
-        if gain[best] > 0:
-            score[k] = worth[k] + gain[best]
-            previous[k] = best
-    chain = [int(np.argmax(score))]
-    while previous[chain[-1]] >= 0:
-        chain.append(int(previous[chain[-1]]))
-    return np.array(chain[::-1]), float(score.max())
+    kept = int(ends.max(initial=0))
+    lengths = np.diff(ends, prepend=0)
+    left_px = views.left.points_px[np.repeat(ranges[:, 0], lengths) + at[:kept]]
+    crossings = _Crossings(at[:kept], nearest[:kept], left_px, right_px[:kept], points_mm[:kept], np.ones(kept))
+    return _ordered(crossings, ends, pairs, lengths * _LENGTHWISE)

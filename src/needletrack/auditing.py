@@ -22,12 +22,12 @@ import numpy as np
 from needletrack.records import Frame, NeedleTrack, StereoPair
 from needletrack.rig import Rig
 from needletrack.tracking.parameters import TrackingParameters
-from needletrack.tracking.track import adopted, audit, follow, search, track_pair
+from needletrack.tracking.track import PAIRS_PER_AUDIT_OF_WEAK, adopted, audit, follow, search, track_pair
 
 _log = logging.getLogger(__name__)
 
-# An audit begins so many pairs after the one before at the soonest, or when that is done; of a weak track earlier.
-_PAIRS_PER_AUDIT, _PAIRS_PER_AUDIT_OF_WEAK = 5, 2
+# With its own time on top, an audit has looked at what is followed within ten pairs of the one before.
+_PAIRS_PER_AUDIT = 5
 # A needle that is lost is looked for where it was for so long, in case something only passed before it.
 _REMEMBERED_NS = 2_000_000_000
 _RESTART_AFTER_S, _STARTS_WITHIN_S, _ENDS_WITHIN_S = 5.0, 30.0, 1.0
@@ -121,7 +121,7 @@ class AuditedTracker:
             return None
 
     def _look_again(self, pair: StereoPair, track: NeedleTrack) -> None:
-        wanted = _PAIRS_PER_AUDIT_OF_WEAK if track.reasons else _PAIRS_PER_AUDIT
+        wanted = PAIRS_PER_AUDIT_OF_WEAK if track.reasons else _PAIRS_PER_AUDIT
         if track.curve is not None and self._since_audit < wanted:
             return
         if self._auditor is None:

@@ -28,6 +28,7 @@ from needletrack.tracking.gates import GateParameters, weaknesses
 from needletrack.tracking.needle import Needle, Range, Workspace
 from needletrack.tracking.parameters import TrackingParameters
 from needletrack.tracking.refine import Refined, RefineModels, refine
+from needletrack.tracking.shape import told_of_curve
 
 GATES = GateParameters()
 GOOD = Quality(reprojection_rms_px=0.05, epipolar_rms_px=0.2, coverage=1.0)
@@ -59,16 +60,17 @@ def reasons(
     previous: NeedleTrack | None = None,
     needle: Needle | None = None,
     workspace: Workspace | None = None,
+    along_epipolar_lines: float = 0.0,
 ) -> tuple[Reason, ...]:
     return weaknesses(
         refined or good(),
         shape or curve(),
         quality,
-        RIG,
         needle or Needle(),
         workspace or Workspace(),
         GATES,
         previous,
+        along_epipolar_lines=along_epipolar_lines,
     )
 
 
@@ -191,7 +193,11 @@ def picture_angle(start_mm: Float, end_mm: Float) -> float:
     [(4.0, 0.6, True), (4.0, 0.4, False), (25.0, 1.0, False), (9.0, 0.9, True)],
 )
 def test_a_long_stretch_along_the_epipolar_lines_is_told(angle_deg: float, share: float, is_weak: bool) -> None:
-    found = reasons(shape=curve(at_angle(angle_deg, share)))
+    points_mm = at_angle(angle_deg, share)
+    fit = replace(good().fit, parameters=np.linspace(0.0, 1.0, len(points_mm)), points_mm=points_mm)
+    covariance_mm2 = np.broadcast_to(0.01 * np.eye(3), (len(points_mm), 3, 3))
+    *_, along = told_of_curve(fit, covariance_mm2, RIG, GATES.epipolar_angle_deg)
+    found = reasons(shape=curve(points_mm), along_epipolar_lines=along)
     assert found == ((Reason.ALONG_EPIPOLAR_LINES,) if is_weak else ())
 
 

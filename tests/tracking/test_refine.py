@@ -58,7 +58,7 @@ def check(found: Refined, shown: Scene) -> None:
     assert np.linalg.norm(points_mm[-1] - truth.tip_mm) < TIP_MM
     assert np.linalg.norm(points_mm[0] - truth.centerline_mm[0]) < BASE_MM
     assert found.base_is_known
-    assert len(points_mm) == len(found.observed[0].offset_px) == len(found.observed[1].offset_px)
+    assert found.shown.shape == (2, len(points_mm))
     # Widths are 4 % apart.
     assert found.diameter_mm == pytest.approx(truth.diameter_mm, rel=0.09)
     for tip_px, true_px in zip(found.tip_px, RIG.project(truth.tip_mm[None]), strict=True):

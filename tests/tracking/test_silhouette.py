@@ -42,7 +42,7 @@ def common_offset_px(view: AxisEvidence) -> tuple[float, float]:
     at = view.likeliest_path_px()
     offset, sigma = 0.0, np.inf
     for spread in SPREADS:
-        seen = view.offsets(at, np.full(COUNT, spread))
+        seen, _ = view.offsets(at, spread)
         assert seen.seen.any()
         offset = float(np.average(seen.offset_px[seen.seen], weights=seen.sigma_px[seen.seen] ** -2.0))
         sigma = float(np.median(seen.sigma_px[seen.seen]))
@@ -160,8 +160,8 @@ def test_what_is_before_clutter_counts_for_less_where_a_streak_leads() -> None:
     half_widths = np.full(COUNT, found.half_width)
     alone, led = (
         replace(axis_evidence(cut, found, half_widths, NEAR), shines=np.full(COUNT, shines)).offsets(
-            np.zeros(COUNT), np.full(COUNT, 0.4)
-        )
+            np.zeros(COUNT), 0.4
+        )[0]
         for shines in (False, True)
     )
     seen = alone.seen & led.seen
@@ -172,7 +172,7 @@ def test_what_is_before_clutter_counts_for_less_where_a_streak_leads() -> None:
 
 
 def expected(view: AxisEvidence, at_px: float = 0.0) -> Float:
-    return view.support(np.full(COUNT, at_px), np.full(COUNT, SPREADS[-1]))
+    return view.offsets(np.full(COUNT, at_px), SPREADS[-1])[1]
 
 
 @pytest.mark.parametrize("look", [DARK, BRIGHT, STEEL], ids=["dark", "bright", "dull steel"])
@@ -189,7 +189,7 @@ def test_support_is_high_on_a_needle_and_negative_beside_it(look: Look) -> None:
     for aside_mm in (-4.0, 4.0):
         beside = sections(look, aside_mm=aside_mm)
         assert np.median(expected(evidence(beside, found))) < 0.0
-        assert not evidence(beside, found).offsets(np.zeros(COUNT), np.full(COUNT, 0.4)).seen.any()
+        assert not evidence(beside, found).offsets(np.zeros(COUNT), 0.4)[0].seen.any()
 
 
 def test_what_is_outside_the_image_or_too_thin_is_not_seen() -> None:
@@ -202,10 +202,10 @@ def test_what_is_outside_the_image_or_too_thin_is_not_seen() -> None:
     assert out.any()
     view = evidence(cut, found)
     assert np.isneginf(expected(view)[out]).all()
-    assert not view.offsets(np.zeros(COUNT), np.full(COUNT, 0.4)).seen[out].any()
+    assert not view.offsets(np.zeros(COUNT), 0.4)[0].seen[out].any()
     half_widths = np.where(np.arange(COUNT) < 10, -1, found.half_width)
     thin = axis_evidence(cut, found, half_widths, NEAR)
-    seen = thin.offsets(np.zeros(COUNT), np.full(COUNT, 0.4)).seen
+    seen = thin.offsets(np.zeros(COUNT), 0.4)[0].seen
     assert not seen[:10].any()
     assert seen[15:35].all()
 

@@ -218,8 +218,8 @@ def glanced(
 ) -> Refined | None:
     """The needle where it has moved since the pair before, looked at once: a hundredth of what `refine` takes.
 
-    What it looks like and where its base is are known. None where a glance does not do: its tip was never seen, or it is
-    so bright that it is white. first_mm: the curve (N, 3) to the tip at which a first glance put it already.
+    What it looks like and where its base is are known. None where a glance does not do: its tip was never seen, or it
+    is so bright that it is white. first_mm: the curve (N, 3) to the tip at which a first glance put it already.
     Raises NeedleNotFound where the views do not show it.
     """
     steady = _steady(previous, since_s, models)

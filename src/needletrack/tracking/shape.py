@@ -21,6 +21,7 @@ from needletrack.records import (
     Status,
     TipPose,
 )
+from needletrack.tracking.fit import CurveFit
 from needletrack.tracking.gates import weaknesses
 from needletrack.tracking.parameters import TrackingParameters
 from needletrack.tracking.refine import Refined
@@ -57,22 +58,11 @@ def judged(refined: Refined, rig: StereoRig, parameters: TrackingParameters, pre
     seen = refined.shown
     # One error for all points of all pairs: it does not average out along the needle.
     refined = replace(refined, calibration_mm2=rig.calibration_covariance_mm2(fit.points_mm))
-    count = len(fit.points_mm)
-    sigma_mm, curvature_per_mm = np.empty((2, count))
     covariance_mm2 = fit.point_covariance_mm2
-    along_epipolar_lines = call(
-        "told_of_curve",
-        np.ascontiguousarray(fit.control_mm),
-        len(fit.control_mm),
-        np.ascontiguousarray(fit.parameters),
-        np.ascontiguousarray(fit.points_mm),
-        count,
-        covariance_mm2 if refined.calibration_mm2 is None else covariance_mm2 + refined.calibration_mm2,
-        *rig.lenses,
-        rig.fundamental,
-        float(np.sin(np.radians(parameters.gates.epipolar_angle_deg))),
-        sigma_mm,
-        curvature_per_mm,
+    if refined.calibration_mm2 is not None:
+        covariance_mm2 = covariance_mm2 + refined.calibration_mm2
+    sigma_mm, curvature_per_mm, along_epipolar_lines = told_of_curve(
+        fit, covariance_mm2, rig, parameters.gates.epipolar_angle_deg
     )
     length_mm = float(arc_length(fit.points_mm)[-1])
     curve = NeedleCurve(fit.points_mm, sigma_mm, seen.sum(axis=0), curvature_per_mm, length_mm)
@@ -94,6 +84,32 @@ def judged(refined: Refined, rig: StereoRig, parameters: TrackingParameters, pre
         along_epipolar_lines=along_epipolar_lines,
     )
     return Shape(refined, curve, quality, reasons)
+
+
+def told_of_curve(
+    fit: CurveFit, covariance_mm2: Float, rig: StereoRig, epipolar_angle_deg: float
+) -> tuple[Float, Float, float]:
+    """The larger sigma (N,) across a curve, mm, of points of covariance (N, 3, 3); its curvature (N,), 1/mm.
+
+    And the share of its points whose picture in the right view runs within an angle of the epipolar lines.
+    """
+    count = len(fit.points_mm)
+    sigma_mm, curvature_per_mm = np.empty((2, count))
+    share = call(
+        "told_of_curve",
+        np.ascontiguousarray(fit.control_mm),
+        len(fit.control_mm),
+        np.ascontiguousarray(fit.parameters),
+        np.ascontiguousarray(fit.points_mm),
+        count,
+        np.ascontiguousarray(covariance_mm2),
+        *rig.lenses,
+        rig.fundamental,
+        float(np.sin(np.radians(epipolar_angle_deg))),
+        sigma_mm,
+        curvature_per_mm,
+    )
+    return sigma_mm, curvature_per_mm, share
 
 
 def differ(curve: NeedleCurve, other: NeedleCurve) -> bool:

@@ -24,8 +24,8 @@ from needletrack.tracking.stopwatch import Stopwatch
 
 # Candidates this close to the best one in score are examined as well: two that hold make the shape ambiguous.
 _RIVAL_SHARE = 0.4
-# What is followed is audited once in so many pairs.
-PAIRS_PER_AUDIT = 6
+# What is followed is audited once in so many pairs; what is weak sooner.
+PAIRS_PER_AUDIT, PAIRS_PER_AUDIT_OF_WEAK = 6, 2
 # A detected line is of the shape that is followed where this share of it lies within so many pixels of it.
 _CONFIRMED_SHARE, _CONFIRMED_PX = 0.5, 5.0
 # What is detected so near to a tip, not behind it, and so long may be more of the needle: the far side of a hook.
@@ -60,7 +60,7 @@ def track_pair(
     if followed is None or followed.curve is None:
         # Lost is not yet gone: the search decides, and its reason is the one that is told.
         return search(pair, rig, parameters, previous)
-    if followed.since_detection < PAIRS_PER_AUDIT:
+    if followed.since_detection < (PAIRS_PER_AUDIT_OF_WEAK if followed.reasons else PAIRS_PER_AUDIT):
         return followed
     return adopted(followed, audit(pair, rig, parameters, followed))
 

@@ -83,6 +83,11 @@ class AuditedTracker:
             except (EOFError, OSError):
                 self._give_up()
 
+    @property
+    def pid(self) -> int | None:
+        """The second process, while there is one."""
+        return None if self._auditor is None else self._auditor.pid
+
     def __call__(self, pair: StereoPair, previous: NeedleTrack | None) -> NeedleTrack:
         """The track of this pair; previous: that of the pair before, None to start without memory."""
         if not self._is_open:
@@ -160,6 +165,11 @@ class _Auditor:
         self._process.start()
         theirs.close()
         self._is_up, self._is_busy = False, False
+
+    @property
+    def pid(self) -> int | None:
+        """Its number."""
+        return self._process.pid
 
     def wait(self, seconds: float) -> None:
         """Wait for it to be there, at most so long."""

@@ -19,7 +19,7 @@ from needletrack.synthetic.rig import default_rig
 from needletrack.synthetic.world import DARK_ON_LIGHT, LIGHT_ON_DARK, STEEL, Lighting, Rod, World
 from needletrack.tracking.needle import EntrySide
 from needletrack.tracking.parameters import TrackingParameters
-from needletrack.tracking.track import track, track_pair
+from needletrack.tracking.track import PAIRS_PER_AUDIT, PAIRS_PER_AUDIT_OF_WEAK, track, track_pair
 
 
 def scored(name: str) -> Score:
@@ -583,26 +583,21 @@ def test_a_needle_that_is_hidden_moves_and_is_uncovered_is_found_again() -> None
     assert score(track, TrueShape.drawn(elsewhere.truth)).tip_mm == pytest.approx(0.0, abs=TIP_MM)
 
 
-def test_a_track_that_slid_onto_something_else_is_noticed_within_ten_pairs() -> None:
-    # As if it had slid: the shape that is followed is a rod's, which looks like the needle that it is taken for.
-    world = replace(WORLDS["dark"], rods=(ROD_LIKE_A_NEEDLE,))
-    shown = seen_at(world)
-    needle = track_pair(shown.pair, RIG)
+@pytest.mark.parametrize("diameter_mm", [0.9, 2.0])
+def test_a_track_that_slid_onto_something_else_is_noticed_within_ten_pairs(diameter_mm: float) -> None:
+    # As if it had slid: the shape that is followed is that of a rod, as thin as the needle or not.
+    start_mm, end_mm = (-28.0, -30.0, 246.0), (-20.0, 25.0, 252.0)
+    shown = seen_at(replace(WORLDS["dark"], rods=(Rod(start_mm, end_mm, diameter_mm),)))
+    needle = tracked("dark")
     assert needle.curve is not None
-    rod_mm = np.linspace(*ROD_ENDS_MM, 60)
-    slid = replace(
-        needle,
-        curve=replace(needle.curve, points_mm=spline.resample(rod_mm, len(needle.curve.points_mm))),
-        tip=None,
-        status=Status.DEGRADED,
-        reasons=(Reason.TIP_NOT_SEEN,),
-    )
-    track = slid
-    for _ in range(10):
-        track = track_pair(shown.pair, RIG, None, track)
-    assert not score(track, TrueShape.drawn(shown.truth)).false_ok
+    rod_mm = spline.resample(np.array([start_mm, end_mm]), len(needle.curve.points_mm))
+    track = replace(needle, curve=replace(needle.curve, points_mm=rod_mm), since_detection=0)
+    for number in range(1, 11):
+        track = track_pair(replace(shown.pair, sequence=number), RIG, None, track)
     assert track.curve is not None
-    assert np.median(distance_from_curve(track.curve.points_mm, needle.curve.points_mm)) < 1.0
+    is_the_needle = np.median(distance_from_curve(track.curve.points_mm, needle.curve.points_mm)) < 1.0
+    # What is as thin as the needle may be it: then it is told that it is not the only one.
+    assert is_the_needle or (diameter_mm == 0.9 and Reason.AMBIGUOUS_SHAPE in track.reasons)
 
 
 # The same input, the same output

@@ -143,7 +143,7 @@ static void bell(double expected, double spread, double low, double step, int64_
 
    grid = (low, step, s) of the shifts, and (low, step, f) of the finer ones. least_gain, least_sigma, used and
    clutter_factor as named there; doubtful (n,): where the last applies. sigma is infinite where the section says
-   nothing. */
+   nothing. offset_px and sigma_px may be null: the support alone is wanted. */
 EXPORT void sites(const double *most, const float *relative, const float *likelihood, int64_t n, double low,
                   double step, int64_t s, double fine_step, int64_t f, const double *expected_px, double spread,
                   const double *px_per_unit, const uint8_t *inside, const uint8_t *doubtful, double least_gain,
@@ -154,7 +154,8 @@ EXPORT void sites(const double *most, const float *relative, const float *likeli
   for (int64_t i = 0; i < n; i++) {
     double scale = px_per_unit[i], expected = expected_px[i] / scale;
     int64_t first, last;
-    offset_px[i] = 0, sigma_px[i] = INFINITY, support[i] = -INFINITY;
+    support[i] = -INFINITY;
+    if (offset_px) offset_px[i] = 0, sigma_px[i] = INFINITY;
     if (!(fabs(expected) < 1e6)) continue;
     bell(expected, spread, low, step, s, weight, &first, &last);
     double sum = 0, norm = 0;

@@ -24,7 +24,7 @@ typedef struct {
   /* How the curve is sampled. */
   /* A needle that is white along more than this share of it is another matter. */
   double white_gray, white_share;
-  double spacing_mm, most_advance_mm, beyond_mm, parabola_mm, least_depth_mm, least_length_mm;
+  double spacing_mm, section_mm, most_advance_mm, beyond_mm, parabola_mm, least_depth_mm, least_length_mm;
   /* Sections and their evidence. */
   int64_t rows_per_section;
   const double *offsets;
@@ -456,7 +456,7 @@ static int glanced(const Glance *g, const Eye *eyes, TipView *views, Found *o) {
   double advance = g->advance_mm;
   advance = advance < -g->most_advance_mm ? -g->most_advance_mm : advance > g->most_advance_mm ? g->most_advance_mm : advance;
   double foreseen = line_arc[g->before - 1] + advance, stop = foreseen + g->beyond_mm;
-  int64_t n = (int64_t)rint(stop / g->spacing_mm) + 1;
+  int64_t n = (int64_t)rint(stop / g->section_mm) + 1;
   n = n < 8 ? 8 : n;
   if (n > o->room) return NO_MEMORY;
   double *at = TAKE(double, n), *points = TAKE(double, 3 * n), *arc = TAKE(double, n), *before_tip = TAKE(double, n),
@@ -470,7 +470,7 @@ static int glanced(const Glance *g, const Eye *eyes, TipView *views, Found *o) {
     before_tip[i] = foreseen - arc[i];
     curve_count += before_tip[i] >= 0;
   }
-  if (curve_count < 8) return TOO_SHORT;
+  if (curve_count < 6) return TOO_SHORT;
   tapered(g, before_tip, n, width);
 
   Told told[2];
@@ -503,8 +503,8 @@ static int glanced(const Glance *g, const Eye *eyes, TipView *views, Found *o) {
   basis(u, n, m, 0, first, mixing);
   if (start_of_fit(points, arc, n, m, first, mixing, g->priors, g->since_s, start, held, smooth, work)) return NOT_HELD;
   memcpy(control, start, (size_t)size * sizeof *control);
-  double share = g->spacing_mm / g->correlation_mm, whole_share = arc[n - 1] / (double)(n - 1) / g->correlation_mm;
-  share = whole_share < 1 ? whole_share : 1;
+  double share = arc[n - 1] / (double)(n - 1) / g->correlation_mm;
+  share = share < 1 ? share : 1;
   Sight sights[2];
   memset(sights, 0, sizeof sights);
   for (int v = 0; v < 2; v++) {
@@ -561,11 +561,11 @@ static int glanced(const Glance *g, const Eye *eyes, TipView *views, Found *o) {
   lengths(moved, n, moved_arc);
 
   /* Its tip, on the curve and beyond it. */
-  int64_t beyond = (int64_t)rint(g->tip_reach_mm / g->spacing_mm), along_count = curve_count + beyond;
+  int64_t beyond = (int64_t)rint(g->tip_reach_mm / g->section_mm), along_count = curve_count + beyond;
   double *along = TAKE(double, 3 * along_count), *along_arc = TAKE(double, along_count), *tip = o->tip;
   if (!along_arc) return NO_MEMORY;
   memcpy(along, moved, (size_t)(3 * curve_count) * sizeof *along);
-  go_on(moved, curve_count, beyond, g->spacing_mm, g->parabola_mm, along + 3 * curve_count);
+  go_on(moved, curve_count, beyond, g->section_mm, g->parabola_mm, along + 3 * curve_count);
   lengths(along, along_count, along_arc);
   int failed = tip_of(g, eyes, views, along, along_arc, along_count, along_arc[curve_count - 1], tip);
   if (failed) return failed;
@@ -577,8 +577,7 @@ static int glanced(const Glance *g, const Eye *eyes, TipView *views, Found *o) {
   /* What was expected where the last look looked is what supports it; its offsets stand. */
   for (int v = 0; v < 2; v++) {
     Told *t = told + v, again = *t;
-    again.offset = TAKE(double, n), again.sigma = TAKE(double, n);
-    if (!again.sigma) return NO_MEMORY;
+    again.offset = again.sigma = 0;
     expect(eyes[v].posed, t, moved, n, local, px);
     look(g, &again, n, g->spreads[g->looks - 1]);
   }

@@ -40,11 +40,11 @@ typedef struct {
 
 /* One view of an end, and the pictures of each shape of end that is tried; as `tip._TipView` lays it out. */
 typedef struct {
-  const double *weight, *weighted, *fixed; /* (n, width), (8, n, width), (8, 8) of `tip_picture` */
+  const double *weight, *weighted, *fixed; /* (n, width), (n, width, 8), (8, 8) of `tip_picture` */
   double noise_gray;
   int64_t parts;
   const double *pictures[8], *own[8];      /* (distances, parts, width) of each shape, and of `pictures_of` ... */
-  const uint8_t *there[8];                 /* ... (distances, parts, parts) and (distances, parts) */
+  const uint8_t *extent[8];                /* ... (distances, parts, parts) and (distances, parts, 2) */
   int64_t distances[8];
   double before_mm[8];
 } TipView;

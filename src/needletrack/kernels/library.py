@@ -129,7 +129,7 @@ class TipView(ctypes.Structure):
         ("parts", ctypes.c_int64),
         ("pictures", ctypes.c_void_p * MOST_SHAPES),
         ("own", ctypes.c_void_p * MOST_SHAPES),
-        ("there", ctypes.c_void_p * MOST_SHAPES),
+        ("extent", ctypes.c_void_p * MOST_SHAPES),
         ("distances", ctypes.c_int64 * MOST_SHAPES),
         ("before_mm", ctypes.c_double * MOST_SHAPES),
     ]

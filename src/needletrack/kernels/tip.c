@@ -49,28 +49,22 @@ static double dot(const double *a, const double *b, int64_t n) {
 /* What is the same wherever the apex is, of the pictures of one shape of end: see `pictures_of`. */
 typedef struct {
   const double *pictures, *own; /* (distances, parts, width), and the parts' products (distances, parts, parts) */
-  const uint8_t *there;         /* (distances, parts): whether a part shows there at all */
+  const uint8_t *extent;        /* (distances, parts, 2): the columns from which to which a part shows there */
 } Shape;
 
-/* Rows are this wide as a rule: a loop of known length vectorises without a rest. */
-#define WIDE 28
-
-static inline double row_dot(const double *a, const double *b, int64_t width) {
-  if (width != WIDE) return dot(a, b, width);
-  double sum = 0;
-  for (int k = 0; k < WIDE; k++) sum += a[k] * b[k];
-  return sum;
-}
+#define KINDS (PLANES + 1)
 
 /* Adds what one row of the view, which shows row `at` of the pictures, says: by planes and grey, and by itself. */
-static void add_row(const Shape *shape, int64_t at, int64_t parts, const double *weighted, int64_t plane_step,
-                    const double *weight, int is_whole, int64_t width, double *mixed, double *own) {
+static void add_row(const Shape *shape, int64_t at, int64_t parts, const double *weighted, const double *weight,
+                    int is_whole, int64_t width, double *mixed, double *own) {
   const double *inside = shape->pictures + at * parts * width;
-  const uint8_t *there = shape->there + at * parts;
+  const uint8_t *extent = shape->extent + 2 * at * parts;
   for (int64_t p = 0; p < parts; p++) {
-    if (!there[p]) continue;
     const double *mine = inside + p * width;
-    for (int q = 0; q <= PLANES; q++) mixed[p * (PLANES + 1) + q] += row_dot(mine, weighted + q * plane_step, width);
+    double sum[KINDS] = {0};
+    for (int64_t k = extent[2 * p]; k < extent[2 * p + 1]; k++)
+      for (int q = 0; q < KINDS; q++) sum[q] += mine[k] * weighted[k * KINDS + q];
+    for (int q = 0; q < KINDS; q++) mixed[p * KINDS + q] += sum[q];
   }
   if (is_whole) {
     const double *all = shape->own + at * parts * parts;
@@ -79,22 +73,26 @@ static void add_row(const Shape *shape, int64_t at, int64_t parts, const double 
   }
   double part[64];
   for (int64_t p = 0; p < parts; p++) {
-    if (!there[p]) continue;
+    if (extent[2 * p] >= extent[2 * p + 1]) continue;
     for (int64_t k = 0; k < width; k++) part[k] = inside[p * width + k] * weight[k];
-    for (int64_t o = 0; o <= p; o++)
-      if (there[o]) own[p * parts + o] += dot(part, inside + o * width, width);
+    for (int64_t o = 0; o <= p; o++) own[p * parts + o] += dot(part, inside + o * width, width);
   }
 }
 
-/* The parts' products (distances, parts, parts) in pictures (distances, parts, width), and whether each shows there. */
+/* The parts' products (distances, parts, parts) in pictures (distances, parts, width), and the columns
+   (distances, parts, 2) from which to which each shows. */
 EXPORT void pictures_of(const double *pictures, int64_t distances, int64_t parts, int64_t width, double *own,
-                        uint8_t *there) {
+                        uint8_t *extent) {
   for (int64_t i = 0; i < distances; i++) {
     const double *row = pictures + i * parts * width;
     for (int64_t p = 0; p < parts; p++) {
-      there[i * parts + p] = 0;
+      uint8_t *mine = extent + 2 * (i * parts + p);
+      mine[0] = mine[1] = 0;
       for (int64_t k = 0; k < width; k++)
-        if (fabs(row[p * width + k]) > 1e-9) there[i * parts + p] = 1;
+        if (fabs(row[p * width + k]) > 1e-6) {
+          if (!mine[1]) mine[0] = (uint8_t)k;
+          mine[1] = (uint8_t)(k + 1);
+        }
       for (int64_t o = 0; o < parts; o++)
         own[(i * parts + p) * parts + o] = dot(row + p * width, row + o * width, width);
     }
@@ -104,14 +102,14 @@ EXPORT void pictures_of(const double *pictures, int64_t distances, int64_t parts
 /* For apexes at_mm (apexes,): squared greys left over, and the log determinant of what the parts could show.
 
    The pictures show each part of the inside at distances before_mm + picture_mm * (0 ... s - 1) before the apex; before
-   and beyond all is as in the outermost. weight (n, width); weighted (8, n, width): planes and grey, weighted; fixed
+   and beyond all is as in the outermost. weight (n, width); weighted (n, width, 8): planes and grey, weighted; fixed
    (8, 8): their products; prior (7 + parts,)^2; arc_mm (n,) of the rows, ascending. work: room for
    (n + 1) * parts * (8 + parts) + n. Returns 1 where it fails. */
 static int misfits(const double *at_mm, int64_t apexes, const double *arc_mm, int64_t n, int64_t width,
                    const Shape *shape, int64_t parts, int64_t s, double before_mm, double picture_mm,
                    const double *weight, const double *weighted, const double *fixed, const double *prior, double *work,
                    double *out) {
-  int64_t each = parts * (PLANES + 1 + parts), size = PLANES + parts, plane = n * width;
+  int64_t each = parts * (PLANES + 1 + parts), size = PLANES + parts;
   uint8_t *whole = (uint8_t *)(work + (n + 1) * each);
   for (int64_t r = 0; r < n; r++) {
     whole[r] = 1;
@@ -125,8 +123,8 @@ static int misfits(const double *at_mm, int64_t apexes, const double *arc_mm, in
     double *sums = work + (r + 1) * each;
     if ((int64_t)rint((farthest - arc_mm[r] - before_mm) / picture_mm) < s - 1) break;
     memcpy(sums, work + r * each, (size_t)each * sizeof *work);
-    add_row(shape, s - 1, parts, weighted + r * width, plane, weight + r * width, whole[r], width, sums,
-            sums + parts * (PLANES + 1));
+    add_row(shape, s - 1, parts, weighted + r * width * KINDS, weight + r * width, whole[r], width, sums,
+            sums + parts * KINDS);
   }
   for (int64_t a = 0; a < apexes; a++) {
     double sums[MOST * (PLANES + 1 + MOST)], normal[(PLANES + MOST) * (PLANES + MOST)], target[PLANES + MOST];
@@ -136,8 +134,8 @@ static int misfits(const double *at_mm, int64_t apexes, const double *arc_mm, in
     for (; r < n; r++) {
       int64_t row = (int64_t)rint((at_mm[a] - arc_mm[r] - before_mm) / picture_mm);
       if (row < 0) break; /* Nothing of it shows from here on. */
-      add_row(shape, row, parts, weighted + r * width, plane, weight + r * width, whole[r], width, sums,
-              sums + parts * (PLANES + 1));
+      add_row(shape, row, parts, weighted + r * width * KINDS, weight + r * width, whole[r], width, sums,
+              sums + parts * KINDS);
     }
     const double *own = sums + parts * (PLANES + 1);
     for (int64_t i = 0; i < size; i++) {
@@ -203,7 +201,7 @@ static double median_of(const double *v, int64_t n, double *work) {
 
 /* One view straightened past an end, of rows local_mm (n, 3) in the camera's frame at arc_mm (n,), across (width,).
 
-   See `tip._Picture`: gray, weight (n, width), weighted (8, n, width), fixed (8, 8), noise_gray; returns the median sine
+   See `tip._look`: gray, weight (n, width), weighted (n, width, 8), fixed (8, 8), noise_gray; returns the median sine
    of the angle to the line of sight. reach: how far the needle reaches to either side, units. rules = (saturated grey,
    margin px, most lag, price of lag, least noise, sigma along, sigma across). work: room for 4 n width + 16 n. */
 EXPORT double tip_picture(const uint8_t *image, int64_t rows, int64_t columns, int64_t stride, const Camera *c,
@@ -260,7 +258,7 @@ EXPORT double tip_picture(const uint8_t *image, int64_t rows, int64_t columns, i
       int64_t at = i * width + k;
       double x = across[k] / last, w = weight[at];
       double v[8] = {1, x, s, x * s, x * x, s * s, smooth[at] - behind, gray[at] - all};
-      for (int p = 0; p < 8; p++) weighted[p * plane + at] = w * v[p];
+      for (int p = 0; p < 8; p++) weighted[8 * at + p] = w * v[p];
       for (int p = 0; p < 8; p++)
         for (int q = 0; q <= p; q++) sums[p][q] += w * v[p] * v[q];
     }
@@ -332,7 +330,7 @@ EXPORT int find_tip(const TipView *views, int64_t shapes, const double *arc_mm, 
   Shape shapes_of[2][MOST_SHAPES];
   for (int v = 0; v < 2; v++)
     for (int64_t k = 0; k < shapes; k++)
-      shapes_of[v][k] = (Shape){views[v].pictures[k], views[v].own[k], views[v].there[k]};
+      shapes_of[v][k] = (Shape){views[v].pictures[k], views[v].own[k], views[v].extent[k]};
   for (int v = 0; v < 2; v++) {
     int64_t size = PLANES + views[v].parts;
     double unit = views[v].noise_gray * views[v].noise_gray * rules[5];

@@ -78,6 +78,9 @@ TIP_REACH_MM, TIP_ROUNDS = 12.0, 4
 # Beyond its end a curve goes on with the bend of so much of it, mm.
 PARABOLA_MM = 12.0
 MIN_DEPTH_MM = 20.0
+# Sections are so much longer than the points of the curve are apart: what is followed changes slowly along itself, and
+# most of the work is proportional to their number.
+_SECTION_SHARE = 1.5
 # Before its tip the needle thins in steps of so many half widths: each has matrices as large as a cache.
 _WIDTH_STEP = 3
 _MOST_CONTROL = 30
@@ -162,7 +165,7 @@ def glance(images: Images, rig: StereoRig, steady: Steady, parameters: GlancePar
         sine = stepped(math.sqrt(max(0.0, 1 - toward)))
         pictures = inside_pictures(steady.taper_mm, shaft, unit_mm(parameters.needle), sine, None)
         pictures.lay_out(view, 0)
-        kept = (*kept, contiguous, pictures.parts, pictures.own, pictures.there)
+        kept = (*kept, contiguous, pictures.parts, pictures.own, pictures.extent)
     room = len(points_mm) + round((MOST_ADVANCE_MM + 2 * _BEYOND_MM) / parameters.spacing_mm) + 16
     found = _Room(room)
     answer = call("glance", now, eyes, views, found.record)
@@ -203,6 +206,7 @@ class _Glance(ctypes.Structure):
         ("white_gray", _D),
         ("white_share", _D),
         ("spacing_mm", _D),
+        ("section_mm", _D),
         ("most_advance_mm", _D),
         ("beyond_mm", _D),
         ("parabola_mm", _D),
@@ -373,12 +377,13 @@ def _wanted(parameters: GlanceParameters, appearance: Appearance) -> tuple[_Glan
         white_gray=CLIPPED_GRAY,
         white_share=WORTH_A_LOOK,
         spacing_mm=parameters.spacing_mm,
+        section_mm=_SECTION_SHARE * parameters.spacing_mm,
         most_advance_mm=MOST_ADVANCE_MM,
         beyond_mm=_BEYOND_MM,
         parabola_mm=PARABOLA_MM,
         least_depth_mm=MIN_DEPTH_MM,
         least_length_mm=needle.min_length_mm / 2,
-        rows_per_section=ROWS_PER_SECTION,
+        rows_per_section=round(_SECTION_SHARE * ROWS_PER_SECTION),
         offsets=at(OFFSETS),
         places=len(OFFSETS),
         unit_mm=unit_mm(needle),

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
+import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict, Field
 from scipy.ndimage import gaussian_filter1d
 from scipy.special import ndtr
@@ -22,7 +23,6 @@ from needletrack.records import Appearance, Float, Image, Reason
 from needletrack.tracking.clipped import Flanks, outline
 from needletrack.tracking.evidence import BLURS, HALF_WIDTHS
 from needletrack.tracking.needle import Needle, Positive
-from needletrack.tracking.profile import Mask
 from needletrack.tracking.silhouette import rows_of, unit_mm
 
 # What is looked at, mm before and beyond a rough end, and the spacing of its rows.
@@ -213,7 +213,7 @@ def _look(
     """
     count, columns = len(local_mm), len(ACROSS)
     gray, weight = np.empty((2, count, columns))
-    weighted, fixed, noise = np.empty((8, count, columns)), np.empty((8, 8)), np.empty(1)
+    weighted, fixed, noise = np.empty((count, columns, 8)), np.empty((8, 8)), np.empty(1)
     sine = call(
         "tip_picture",
         *rows_of(image),
@@ -239,7 +239,7 @@ def _look(
     for shape, taper_mm in enumerate(needle.tip_tapers_mm):
         pictures = inside_pictures(taper_mm, appearance, unit_mm(needle), stepped(sine), edge)
         pictures.lay_out(view, shape)
-        kept += [pictures.parts, pictures.own, pictures.there]
+        kept += [pictures.parts, pictures.own, pictures.extent]
     return kept
 
 
@@ -257,20 +257,20 @@ def stepped(sine: float) -> float:
 class EndPictures:
     """Pictures (S, parts, columns) of each part of the inside of an end, from before_mm before its apex on.
 
-    own (S, parts, parts): their products; there (S, parts): whether a part shows there at all. Before and beyond them
-    all is as in the outermost.
+    own (S, parts, parts): their products; extent (S, parts, 2): the columns from which to which a part shows. Before
+    and beyond them all is as in the outermost.
     """
 
     before_mm: float
     parts: Float
     own: Float
-    there: Mask
+    extent: npt.NDArray[np.uint8]
 
     def lay_out(self, view: TipView, shape: int) -> None:
         """Hands them to the kernel as those of a shape; the view points to their arrays."""
         view.parts, view.distances[shape], view.before_mm[shape] = self.parts.shape[1], len(self.parts), self.before_mm
         view.pictures[shape], view.own[shape] = address(self.parts), address(self.own)
-        view.there[shape] = address(self.there)
+        view.extent[shape] = address(self.extent)
 
 
 @lru_cache(maxsize=64)
@@ -304,9 +304,9 @@ def inside_pictures(
     smooth = gaussian_filter1d(parts, along_mm / PICTURE_MM, axis=1, mode="nearest")
     pictures = np.ascontiguousarray(smooth.swapaxes(0, 1))
     distances, count, columns = pictures.shape
-    own, there = np.empty((distances, count, count)), np.empty((distances, count), np.bool_)
-    call("pictures_of", pictures, distances, count, columns, own, there)
-    return EndPictures(float(before[0]), pictures, own, there)
+    own, extent = np.empty((distances, count, count)), np.empty((distances, count, 2), np.uint8)
+    call("pictures_of", pictures, distances, count, columns, own, extent)
+    return EndPictures(float(before[0]), pictures, own, extent)
 
 
 @lru_cache(maxsize=1)

@@ -80,7 +80,7 @@ PARABOLA_MM = 12.0
 MIN_DEPTH_MM = 20.0
 # Sections are so much longer than the points of the curve are apart: what is followed changes slowly along itself, and
 # most of the work is proportional to their number.
-_SECTION_SHARE = 1.5
+_SECTION_SHARE = 1.0
 # Before its tip the needle thins in steps of so many half widths: each has matrices as large as a cache.
 _WIDTH_STEP = 3
 _MOST_CONTROL = 30

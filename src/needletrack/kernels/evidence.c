@@ -126,14 +126,14 @@ static void bell(double expected, double spread, double low, double step, int64_
   int64_t i = near;
   for (i = near + 1; i < count; i++) {
     value *= ratio, ratio *= shrink;
-    if (value < 1e-14) break;
+    if (value < 1e-10) break;
     out[i] = (float)value;
   }
   *last = i;
   value = 1, ratio = exp(-(-step * off + step * step / 2) * precision);
   for (i = near - 1; i >= 0; i--) {
     value *= ratio, ratio *= shrink;
-    if (value < 1e-14) break;
+    if (value < 1e-10) break;
     out[i] = (float)value;
   }
   *first = i + 1;

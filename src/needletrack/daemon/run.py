@@ -17,12 +17,16 @@ from needletrack.capture.pairing import SkewReport
 from needletrack.capture.source import FrameSource
 from needletrack.config import Config
 from needletrack.daemon.metrics import Metrics
+from needletrack.daemon.overlay import Overlays
 from needletrack.daemon.process import AlreadyRunning, OnlyInstance, lock_memory, schedule_thread, settle_memory
 from needletrack.daemon.record import both_cameras
 from needletrack.daemon.systemd import Notifier
 from needletrack.errors import CaptureError, ConfigError
 from needletrack.publish.message import RunContext, Source, TrackMessage, WireCamera, WireRecording, WireSkew
+from needletrack.publish.overlay import OverlayPublisher
 from needletrack.publish.publisher import ZenohPublisher
+from needletrack.publish.session import open_endpoints
+from needletrack.publish.tls import TlsFiles
 from needletrack.recording.mcap_file import About
 from needletrack.recording.recorder import Recorder, RecorderSettings
 from needletrack.records import DropReason, Frame, NeedleTrack, StereoPair
@@ -90,6 +94,7 @@ class Daemon:
         self.context = RunContext(rig.name, Source.LIVE, config.digest, rig.digest, frame_id=rig.frame_id)
         self._cameras = both_cameras(config, kernel)
         self._recorder: Recorder | None = None
+        self._overlays: Overlays | None = None
         self.service: Service | None = None
 
     def run(self, stop: threading.Event, *, ready: Callable[[], None] = lambda: None) -> DaemonSummary:
@@ -120,6 +125,10 @@ class Daemon:
                 in_threads=self._in_thread,
             )
             publisher = opened.enter_context(self._publisher(service))
+            if config.publishing.overlay.rate_hz > 0:
+                self._overlays = opened.enter_context(self._overlays_of(publisher))
+            for endpoint in open_endpoints(listened_on(config)):
+                _log.warning("anybody on the network may read and publish at %s: set publishing.tls", endpoint)
             metrics = opened.enter_context(Metrics(service, self.surroundings, config.daemon.metrics_port))
             if config.daemon.lock_memory:
                 lock_memory()
@@ -134,6 +143,8 @@ class Daemon:
             sinks: list[Sink] = [_Published(publisher), metrics]
             if self._recorder is not None:
                 sinks.append(self._recorder)
+            if self._overlays is not None:
+                sinks.append(self._overlays)
             run = service.run(sinks, stop)
             notifier.stopping()
         recorder = self._recorder
@@ -161,6 +172,8 @@ class Daemon:
                 error=state.error,
             )
             last_error = state.error or last_error
+        if self._overlays is not None:
+            last_error = last_error or self._overlays.last_error
         skew = WireSkew.model_validate(asdict(self._cameras.skew))
         return Surroundings(cameras, skew, recording, last_error)
 
@@ -173,7 +186,13 @@ class Daemon:
             connect=settings.connect,
             key_prefix=settings.key_prefix,
             heartbeat_s=settings.heartbeat_s,
+            tls=TlsFiles.configured(settings.tls),
         )
+
+    def _overlays_of(self, publisher: ZenohPublisher) -> Overlays:
+        settings, tls = self.config.publishing.overlay, TlsFiles.configured(self.config.publishing.tls)
+        pictures = OverlayPublisher(publisher.keys, listen=settings.listen, connect=settings.connect, tls=tls)
+        return Overlays(pictures, self.rig, settings.rate_hz, settings.jpeg_quality)
 
     def _about(self) -> About:
         return About(self.rig, self.rig.name, self.context.run_id, self.config.model_dump_json())
@@ -254,6 +273,12 @@ def exit_code(error: Exception) -> ExitCode:
     if isinstance(error, AlreadyRunning):
         return ExitCode.ALREADY_RUNNING
     return ExitCode.CAMERAS if isinstance(error, CaptureError) else ExitCode.UNUSABLE
+
+
+def listened_on(config: Config) -> tuple[str, ...]:
+    """All endpoints at which the daemon listens, as configured."""
+    settings = config.publishing
+    return (*settings.listen, *(settings.overlay.listen if settings.overlay.rate_hz > 0 else ()))
 
 
 def _recorder_settings(config: Config) -> RecorderSettings:

@@ -13,6 +13,7 @@ from needletrack.errors import PublishError
 from needletrack.publish.keys import DEFAULT_PREFIX, STATUS_ENCODING, TRACK_ENCODING, RigKeys
 from needletrack.publish.message import RunContext, StatusMessage, TrackMessage
 from needletrack.publish.session import DEFAULT_ENDPOINT, direct, open_session
+from needletrack.publish.tls import TlsFiles
 
 DEFAULT_HEARTBEAT_S = 0.5
 
@@ -20,8 +21,9 @@ DEFAULT_HEARTBEAT_S = 0.5
 class ZenohPublisher:
     """Publishes one rig's tracks; waits for no subscriber, and at most 1 ms for one whose link is full.
 
-    status is called once a heartbeat, from this object's own thread, and once more on closing. Raises
-    PublishError where an endpoint is taken or malformed. An error of `status` is raised by the next
+    status is called once a heartbeat, from this object's own thread, and once more on closing. tls: whoever
+    connects then shows a certificate, and may do what its role may. Raises PublishError where an endpoint is taken
+    or malformed, or a file of tls cannot be used. An error of `status` is raised by the next
     `publish` or by `close`.
     """
 
@@ -34,6 +36,7 @@ class ZenohPublisher:
         connect: Sequence[str] = (),
         key_prefix: str = DEFAULT_PREFIX,
         heartbeat_s: float = DEFAULT_HEARTBEAT_S,
+        tls: TlsFiles | None = None,
     ) -> None:
         self.keys = RigKeys(run.rig, key_prefix)
         self._status = status
@@ -43,7 +46,7 @@ class ZenohPublisher:
         self._stop = threading.Event()
         self._failure: Exception | None = None
         with ExitStack() as opened:
-            session = opened.enter_context(open_session(listen, connect))
+            session = opened.enter_context(open_session(listen, connect, tls=tls, rigs=[self.keys]))
             self._declare(session)
             # Last, and so first to go: whoever sees the token can query, and gets the last heartbeat.
             opened.enter_context(session.liveliness().declare_token(self.keys.alive))

@@ -225,6 +225,7 @@ def run(rig: RunRig = None, config: ConfigFile = None) -> None:
     from needletrack.config import load_config
     from needletrack.daemon.logs import logged
     from needletrack.daemon.run import Daemon, exit_code
+    from needletrack.publish.session import is_still_closing
     from needletrack.terminal import Interruption, described_skew
     from needletrack.terminal import described as described_run
 
@@ -241,6 +242,9 @@ def run(rig: RunRig = None, config: ConfigFile = None) -> None:
     typer.echo(described_skew(summary.skew), err=True)
     if summary.recorded is not None:
         typer.echo(f"  recorded: {summary.recorded} pairs, not recorded: {summary.unrecorded}", err=True)
+    if is_still_closing():
+        # All is done and told; Zenoh would keep the process for up to 10 s, for a subscriber that hangs.
+        os._exit(0)
 
 
 @app.command()

@@ -71,7 +71,9 @@ class Relay:
 
     async def _listen(self) -> None:
         if self._server is None:
-            self._server = await asyncio.start_server(self._accept, "127.0.0.1", self.port, limit=_BUFFER)
+            listening = _socket()
+            listening.bind(("127.0.0.1", self.port))
+            self._server = await asyncio.start_server(self._accept, sock=listening, limit=_BUFFER)
 
     async def _cut(self) -> None:
         if self._server is not None:
@@ -88,7 +90,13 @@ class Relay:
         self._links.add(link)
         try:
             with suppress(OSError):
-                far, to_far = await asyncio.open_connection("127.0.0.1", self._to, limit=_BUFFER)
+                outward = _socket()
+                try:
+                    await self._loop.sock_connect(outward, ("127.0.0.1", self._to))
+                except OSError:
+                    outward.close()
+                    raise
+                far, to_far = await asyncio.open_connection(sock=outward, limit=_BUFFER)
                 for writer in (to_near, to_far):
                     writer.transport.set_write_buffer_limits(_BUFFER)
                 ways = [asyncio.create_task(way) for way in (self._pass(near, to_far), self._pass(far, to_near))]
@@ -126,3 +134,12 @@ class Relay:
         finally:
             delivering.cancel()
             await asyncio.gather(delivering, return_exceptions=True)
+
+
+def _socket() -> socket.socket:
+    made = socket.socket()
+    made.setblocking(False)
+    made.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    # Left alone, the kernel would take megabytes off the sender's hands here, which no cable does.
+    made.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _BUFFER)
+    return made

@@ -210,12 +210,12 @@ def test_a_client_that_is_closed_before_its_router_came_waits_for_nothing(tmp_pa
 
 def test_a_peer_at_a_router_is_told_to_be_a_client(tmp_path: Path) -> None:
     port = free_port()
-    with router_here(local("router.json5", tmp_path, {7447: port})):
-        with (
-            Subscriber("lab", [f"tcp/127.0.0.1:{port}"]) as subscriber,
-            pytest.raises(PublishError, match="routers pass nothing on between two peers: be a client"),
-        ):
-            subscriber.wait_for_daemon(0.5)
+    with (
+        router_here(local("router.json5", tmp_path, {7447: port})),
+        Subscriber("lab", [f"tcp/127.0.0.1:{port}"]) as subscriber,
+        pytest.raises(PublishError, match="routers pass nothing on between two peers: be a client"),
+    ):
+        subscriber.wait_for_daemon(0.5)
 
 
 def test_a_client_listens_on_nothing() -> None:
@@ -297,12 +297,13 @@ def over_a_link() -> Iterator[tuple[Relay, Receiving, Publishing]]:
 
 
 def test_a_link_that_is_cut_and_heals() -> None:
-    with over_a_link() as (link, receiving, _):
+    with over_a_link() as (link, receiving, publishing):
         assert all(receiving.more() for _ in range(20))
         for _ in range(2):
             link.cut()
             receiving.loses_sight()
-            before = receiving.lost
+            before, published = receiving.lost, publishing.published
+            assert eventually(lambda least=published + 10: publishing.published > least)  # type: ignore[misc]
             link.heal()
             assert all(receiving.more() for _ in range(20))
             assert receiving.lost > before
@@ -333,12 +334,28 @@ def test_a_slow_way_shows_in_the_age_and_loses_nothing() -> None:
         assert receiving.accounted_for()
 
 
-def test_a_narrow_link_loses_tracks_and_says_so_and_what_comes_is_not_ages_old() -> None:
-    with over_a_link() as (link, receiving, publishing):
+@pytest.mark.slow
+def test_a_narrow_link_loses_tracks_rather_than_to_let_them_grow_old(monkeypatch: pytest.MonkeyPatch) -> None:
+    points = 200
+    line = tuple((1.123456 + number, 2.123456, 3.123456) for number in range(points))
+    monkeypatch.setattr(
+        sys.modules[__name__],
+        "TRACK",
+        TRACK.model_copy(
+            update={
+                "centerline_mm": line,
+                "sigma_mm": (0.123456,) * points,
+                "seen": (2,) * points,
+                "curvature_per_mm": (0.012345678,) * points,
+            }
+        ),
+    )
+    with over_a_link() as (link, receiving, _):
         assert all(receiving.more() for _ in range(5))
-        size = len(TRACK.to_json())
-        link.bytes_per_s = 0.25 * size / PERIOD_S
-        assert eventually(lambda: receiving.more() and receiving.lost > 50, timeout_s=30)
-        ages = [one.transit_ms for one in receiving.received if one.transit_ms is not None]
-        print(size, publishing.published, max(ages), ages[-5:])
+        link.bytes_per_s = 0.5 * len(TRACK.to_json()) / PERIOD_S
+        assert eventually(lambda: receiving.more() and receiving.lost > 100, timeout_s=60)
+        ages_s = [one.transit_ms / 1000 for one in receiving.received if one.transit_ms is not None]
+        # On the way are the send buffer (which the kernel doubles), the relay's own, and Zenoh's batches: without a
+        # bound to the first, megabytes.
+        assert max(ages_s) * link.bytes_per_s < 700_000
         assert receiving.accounted_for()

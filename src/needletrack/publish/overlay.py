@@ -16,7 +16,7 @@ import zenoh
 from needletrack.errors import PublishError
 from needletrack.publish.keys import OVERLAY_ENCODING, RigKeys
 from needletrack.publish.message import TrackMessage
-from needletrack.publish.session import direct, open_session
+from needletrack.publish.session import close_soon, direct, open_session
 from needletrack.publish.tls import TlsFiles
 
 
@@ -41,7 +41,7 @@ class OverlayPublisher:
             )
             self._pictures.declare_matching_listener(direct(self._on_matching))
             # A program that ends without `close` closes the session all the same.
-            self._close_session = weakref.finalize(self, opened.pop_all().close)
+            self._close_session = weakref.finalize(self, close_soon, opened.pop_all())
 
     @property
     def has_subscriber(self) -> bool:

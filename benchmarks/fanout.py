@@ -3,13 +3,15 @@
 A daemon's publisher sends tracks of 12 kB at a steady rate, one subscriber in a process of its own takes the time from
 `published_at_ns` to the receipt, and beside it are, in turn: nobody; ten more subscribers; one whose callback takes
 50 ms; one that was stopped (SIGSTOP); one that reads frames of 1.3 MB from the pictures' session; all of these at
-once. For comparison: the frames on the poses' own session, and poses that are not express. The cases run in turn,
+once. For comparison: poses that are not express, and the frames on the poses' own session, read there by the one
+subscriber, whose callback takes 20 ms for a frame. The cases run in turn,
 several rounds, and each round's 99th percentile is compared with that of nobody in the same round.
 """
 
 import argparse
 import json
 import os
+import queue
 import signal
 import socket
 import statistics
@@ -26,6 +28,7 @@ RIG = "lab"
 FRAME_BYTES = 1280 * 1024
 WARM_UP_S = 1.0
 SLOW_S = 0.05
+FRAME_WORK_S = 0.02
 BAR_MS = 2.0
 PRIORITY = 50
 _STARTED_WITHIN_S = 60.0
@@ -47,6 +50,7 @@ class Case:
     beside: tuple[str, ...] = ()
     frames: str = ""
     express: bool = True
+    measuring: str = "measure"
     held_to_bar: bool = True
 
 
@@ -59,7 +63,7 @@ CASES = (
     Case("1.3 MB frames", ("frames",), frames="apart"),
     Case("all of these", (*TEN, "slow", "stopped", "frames"), frames="apart"),
     Case("not express", express=False, held_to_bar=False),
-    Case("frames on the poses' session", ("frames-slow",), frames="together", held_to_bar=False),
+    Case("frames on the poses' session", frames="together", measuring="measure-both", held_to_bar=False),
 )
 
 
@@ -132,7 +136,7 @@ def run(case: Case, place: Place, rate_hz: float, seconds: float) -> Outcome:
             bystander = started("idle" if role == "stopped" else role, place.subscriber)
             if role == "stopped":
                 bystander.send_signal(signal.SIGSTOP)
-        measuring = started("measure", place.subscriber)
+        measuring = started(case.measuring, place.subscriber)
         assert daemon.stdin is not None
         daemon.stdin.write("go\n")
         daemon.stdin.flush()
@@ -231,8 +235,6 @@ def publish(tracks: str, frames: str, asked: argparse.Namespace) -> None:
 
 def measure(tracks: str, rate_hz: float) -> None:
     """The subscriber that takes the times."""
-    import numpy as np
-
     from needletrack.client import Subscriber
 
     transits_ms: list[float] = []
@@ -247,6 +249,49 @@ def measure(tracks: str, rate_hz: float) -> None:
             if received.message.sequence >= rate_hz * WARM_UP_S and received.transit_ms is not None:
                 transits_ms.append(received.transit_ms)
                 lost += received.missed.lost
+    _tell(transits_ms, lost)
+
+
+def measure_beside_frames(tracks: str, rate_hz: float) -> None:
+    """The same on one session with the frames: what a reader of both does to itself."""
+    import zenoh
+
+    from needletrack.publish.message import TrackMessage
+    from needletrack.publish.session import direct, open_session
+
+    came: queue.SimpleQueue[tuple[int, bytes]] = queue.SimpleQueue()
+    with open_session(connect=[tracks]) as session:
+
+        def take(sample: zenoh.Sample) -> None:
+            came.put((time.time_ns(), sample.payload.to_bytes()))
+
+        def take_frame(_: zenoh.Sample) -> None:
+            time.sleep(FRAME_WORK_S)
+
+        session.declare_subscriber(f"needletrack/{RIG}/overlay", direct(take_frame))
+        session.declare_subscriber(f"needletrack/{RIG}/track", direct(take))
+        while not session.info.transports():
+            time.sleep(0.02)
+        time.sleep(0.3)
+        print("ready", flush=True)
+        wait_s, last, lost = _STARTED_WITHIN_S, None, 0
+        transits_ms: list[float] = []
+        while True:
+            try:
+                received_at_ns, payload = came.get(timeout=wait_s)
+            except queue.Empty:
+                break
+            wait_s, message = _SILENT_S, TrackMessage.from_json(payload)
+            if message.sequence >= rate_hz * WARM_UP_S and message.published_at_ns is not None:
+                transits_ms.append((received_at_ns - message.published_at_ns) / 1e6)
+                lost += 0 if last is None else message.sequence - last - 1
+            last = message.sequence
+    _tell(transits_ms, lost)
+
+
+def _tell(transits_ms: list[float], lost: int) -> None:
+    import numpy as np
+
     p50, p99 = np.percentile(transits_ms, [50, 99]).tolist()
     answer = {"p50_ms": p50, "p99_ms": p99, "worst_ms": max(transits_ms), "received": len(transits_ms), "lost": lost}
     print(json.dumps(answer), flush=True)
@@ -323,20 +368,21 @@ def main(arguments: Sequence[str] | None = None) -> int:
     asked = parser.parse_args(arguments)
     if asked.role is not None:
         tracks, frames = asked.endpoints
-        if asked.role in ("publish", "measure") and may_schedule(PRIORITY):
+        if asked.role in ("publish", "measure", "measure-both") and may_schedule(PRIORITY):
             # Zenoh's threads as well, which begin later.
             os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(PRIORITY))
         if asked.role == "publish":
             publish(tracks, frames, asked)
         elif asked.role == "measure":
             measure(tracks, asked.rate)
+        elif asked.role == "measure-both":
+            measure_beside_frames(tracks, asked.rate)
         else:
             stand_by(asked.role, tracks, frames)
         return 0
     met, fifo = True, may_schedule(PRIORITY)
-    print(
-        f"daemon and measuring subscriber: {'SCHED_FIFO, so that other jobs here count less' if fifo else 'not real-time'}"
-    )
+    scheduled = "SCHED_FIFO, so that other jobs here count less" if fifo else "ordinary scheduling"
+    print(f"daemon and measuring subscriber: {scheduled}")
     with ExitStack() as opened:
         places = [Place("loopback", "127.0.0.1")]
         try:

@@ -197,7 +197,7 @@ def test_each_role_does_what_it_may(pki: Path, routed: bool) -> None:
 
 
 @EVERY_SCENE
-@pytest.mark.parametrize("identity", ["other/controller", "other/operator", "other/publisher", None])
+@pytest.mark.parametrize("identity", ["other/controller", "other/publisher", None])
 def test_who_is_not_of_the_rig_reads_nothing(pki: Path, routed: bool, identity: str | None) -> None:
     authority = pki / "authority" / "authority.pem"
     with scene(pki, routed=routed) as at, intruder(at, pki) as allowed:
@@ -432,6 +432,7 @@ class TestFiles:
             replace(tls, authority=tmp_path / "second" / "authority" / "authority.pem").check()
 
 
+@pytest.mark.slow
 def test_secrets_are_in_no_output(pki: Path, tmp_path: Path) -> None:
     """Neither in errors nor in logs, at the most talkative, of a daemon's and a subscriber's program."""
     role = pki / "lab" / "controller"

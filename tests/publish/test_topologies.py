@@ -255,6 +255,7 @@ def routed(tmp_path: Path) -> Iterator[tuple[Path, Receiving]]:
         yield path, Receiving(subscriber)
 
 
+@pytest.mark.slow
 def test_a_router_that_was_killed_and_came_back(tmp_path: Path) -> None:
     with routed(tmp_path) as (path, receiving):
         with router_process(path) as router:
@@ -267,6 +268,7 @@ def test_a_router_that_was_killed_and_came_back(tmp_path: Path) -> None:
         assert receiving.accounted_for()
 
 
+@pytest.mark.slow
 def test_a_router_that_hung_and_went_on(tmp_path: Path) -> None:
     with routed(tmp_path) as (path, receiving), router_process(path) as router:
         assert all(receiving.more() for _ in range(20))

@@ -12,10 +12,16 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime, timedelta
+from ipaddress import ip_address
 from pathlib import Path
 
 import pytest
 import zenoh
+from cryptography import x509
+from cryptography.hazmat.primitives import hashes
+from cryptography.hazmat.primitives.asymmetric import ec
+from cryptography.hazmat.primitives.serialization import Encoding, NoEncryption, PrivateFormat
+from cryptography.x509.oid import NameOID
 from tests.publish.network import WAIT_S, eventually, free_port, raw_session
 from typer.testing import CliRunner
 
@@ -430,6 +436,43 @@ class TestFiles:
         init_security(tmp_path / "second", "lab")
         with pytest.raises(PublishError, match="was not issued by an authority in"):
             replace(tls, authority=tmp_path / "second" / "authority" / "authority.pem").check()
+
+
+def test_a_pki_with_an_authority_in_between(tmp_path: Path) -> None:
+    """As of a hospital's: the root is trusted, the certificate in between stands behind ours."""
+    now, days = datetime.now(UTC), timedelta(days=1)
+    keys = {
+        name: ec.generate_private_key(ec.SECP256R1()) for name in ("root", "between", "lab.publisher", "lab.controller")
+    }
+
+    def issued(name: str, by: str) -> str:
+        subject, issuer = (x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, one)]) for one in (name, by))
+        begun = x509.CertificateBuilder().subject_name(subject).issuer_name(issuer).serial_number(len(name))
+        begun = begun.public_key(keys[name].public_key()).not_valid_before(now - days).not_valid_after(now + days)
+        begun = begun.add_extension(x509.BasicConstraints(ca="." not in name, path_length=None), critical=True)
+        begun = begun.add_extension(
+            x509.SubjectAlternativeName([x509.IPAddress(ip_address("127.0.0.1"))]), critical=False
+        )
+        return begun.sign(keys[by], hashes.SHA256()).public_bytes(Encoding.PEM).decode()
+
+    between, ends = issued("between", "root"), {}
+    (tmp_path / "root.pem").write_text(issued("root", "root"))
+    for name in ("lab.publisher", "lab.controller"):
+        key, certificate = tmp_path / f"{name}.key", tmp_path / f"{name}.pem"
+        key.touch(mode=0o600)
+        key.write_bytes(keys[name].private_bytes(Encoding.PEM, PrivateFormat.PKCS8, NoEncryption()))
+        certificate.write_text(issued(name, "between") + between)
+        ends[name] = TlsFiles(tmp_path / "root.pem", certificate, key)
+    endpoint = f"tls/127.0.0.1:{free_port()}"
+    with (
+        ZenohPublisher(example_run(), lambda: STATUS, listen=[endpoint], tls=ends["lab.publisher"]),
+        Subscriber("lab", [endpoint], tls=ends["lab.controller"]) as subscriber,
+    ):
+        subscriber.wait_for_daemon(WAIT_S)
+    alone = tmp_path / "alone.pem"
+    alone.write_text(issued("lab.controller", "between"))
+    with pytest.raises(PublishError, match="put certificates in between behind ours"):
+        replace(ends["lab.controller"], certificate=alone).check()
 
 
 @pytest.mark.slow

@@ -19,6 +19,7 @@ from needletrack.capture.source import FrameSource
 from needletrack.config import Config
 from needletrack.daemon.control import Operator, authority
 from needletrack.daemon.metrics import Metrics
+from needletrack.daemon.overlay import Overlays
 from needletrack.daemon.process import AlreadyRunning, OnlyInstance, lock_memory, schedule_thread, settle_memory
 from needletrack.daemon.record import both_cameras
 from needletrack.daemon.systemd import Notifier
@@ -26,7 +27,10 @@ from needletrack.errors import CaptureError, ConfigError
 from needletrack.publish.control import ControlDesk
 from needletrack.publish.keys import RigKeys
 from needletrack.publish.message import RunContext, Source, TrackMessage, WireCamera, WireRecording, WireSkew
+from needletrack.publish.overlay import OverlayPublisher
 from needletrack.publish.publisher import ZenohPublisher
+from needletrack.publish.session import open_endpoints
+from needletrack.publish.tls import TlsFiles
 from needletrack.recording.mcap_file import About
 from needletrack.recording.recorder import Recorder, RecorderSettings
 from needletrack.records import DropReason, Frame, NeedleTrack, StereoPair
@@ -95,6 +99,7 @@ class Daemon:
         self._recorder: Recorder | None = None
         self._operator: Operator | None = None
         self._desk: ControlDesk | None = None
+        self._overlays: Overlays | None = None
         self.service: Service | None = None
 
     def run(self, stop: threading.Event, *, ready: Callable[[], None] = lambda: None) -> DaemonSummary:
@@ -136,6 +141,10 @@ class Daemon:
             keys = RigKeys(rig.name, config.publishing.key_prefix)
             desk = self._desk = ControlDesk(self.context, keys, operator.handlers, may_control)
             publisher = opened.enter_context(self._publisher(service, desk))
+            if config.publishing.overlay.rate_hz > 0:
+                self._overlays = opened.enter_context(self._overlays_of(publisher))
+            for endpoint in open_endpoints(listened_on(config)):
+                _log.warning("anybody on the network may read and publish at %s: set publishing.tls", endpoint)
             metrics = opened.enter_context(Metrics(service, self.surroundings, config.daemon.metrics_port))
             if config.daemon.lock_memory:
                 lock_memory()
@@ -151,6 +160,8 @@ class Daemon:
             sinks: list[Sink] = [_Published(publisher), metrics, operator.newest]
             if self._recorder is not None:
                 sinks.append(self._recorder)
+            if self._overlays is not None:
+                sinks.append(self._overlays)
             run = service.run(sinks, stop)
             notifier.stopping()
         recorder = self._recorder
@@ -178,6 +189,8 @@ class Daemon:
                 error=state.error,
             )
             last_error = state.error or last_error
+        if self._overlays is not None:
+            last_error = last_error or self._overlays.last_error
         skew = WireSkew.model_validate(asdict(self._cameras.skew))
         needle = None if self._operator is None else self._operator.needle
         counters = {} if self._desk is None else {f"control_{name}": n for name, n in self._desk.counts.items()}
@@ -193,7 +206,13 @@ class Daemon:
             key_prefix=settings.key_prefix,
             heartbeat_s=settings.heartbeat_s,
             control=desk.receive,
+            tls=TlsFiles.configured(settings.tls),
         )
+
+    def _overlays_of(self, publisher: ZenohPublisher) -> Overlays:
+        settings, tls = self.config.publishing.overlay, TlsFiles.configured(self.config.publishing.tls)
+        pictures = OverlayPublisher(publisher.keys, listen=settings.listen, connect=settings.connect, tls=tls)
+        return Overlays(pictures, self.rig, settings.rate_hz, settings.jpeg_quality)
 
     def _about(self, config: Config) -> About:
         return About(self.rig, self.rig.name, self.context.run_id, config.model_dump_json())
@@ -266,6 +285,12 @@ def exit_code(error: Exception) -> ExitCode:
     if isinstance(error, AlreadyRunning):
         return ExitCode.ALREADY_RUNNING
     return ExitCode.CAMERAS if isinstance(error, CaptureError) else ExitCode.UNUSABLE
+
+
+def listened_on(config: Config) -> tuple[str, ...]:
+    """All endpoints at which the daemon listens, as configured."""
+    settings = config.publishing
+    return (*settings.listen, *(settings.overlay.listen if settings.overlay.rate_hz > 0 else ()))
 
 
 def _recorder_settings(config: Config) -> RecorderSettings:

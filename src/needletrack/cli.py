@@ -71,6 +71,15 @@ RigFile = Annotated[
 Independent = Annotated[
     bool, typer.Option("--independent", help="Start every pair without memory: for recordings of stills.")
 ]
+Connect = Annotated[
+    list[str] | None,
+    typer.Option(
+        metavar="ENDPOINT",
+        help=f"Where the daemon or its router is; else subscribing.connect, by default {DEFAULT_ENDPOINT}.",
+    ),
+]
+KeyPrefix = Annotated[str | None, typer.Option(help="As in the daemon's; else subscribing.key_prefix.")]
+AsClient = Annotated[bool, typer.Option("--client", help="Be a client, of a router; else as subscribing.mode.")]
 Start = Annotated[int, typer.Option(min=0, help="First pair, from 0.")]
 End = Annotated[int | None, typer.Option(min=0, help="The pair after the last; all without it.")]
 Method = Annotated[Literal["curve", "reference"], typer.Option(help="Ours, or that of 2017.")]
@@ -356,18 +365,10 @@ def doctor(
 @plain_errors
 def watch(
     rig: Annotated[str, typer.Argument(metavar="RIG", help="The rig's name, which is part of the key.")],
-    connect: Annotated[
-        list[str] | None,
-        typer.Option(
-            metavar="ENDPOINT",
-            help=f"Where the daemon or its router is; else subscribing.connect, by default {DEFAULT_ENDPOINT}.",
-        ),
-    ] = None,
+    connect: Connect = None,
     config: ConfigFile = None,
-    key_prefix: Annotated[str | None, typer.Option(help="As in the daemon's; else subscribing.key_prefix.")] = None,
-    client: Annotated[
-        bool, typer.Option("--client", help="Be a client, of a router; else as subscribing.mode.")
-    ] = False,
+    key_prefix: KeyPrefix = None,
+    client: AsClient = False,
     until_gone: Annotated[bool, typer.Option("--until-gone", help="End when the daemon does.")] = False,
     count: Annotated[int | None, typer.Option(min=1, help="End after so many tracks.")] = None,
     wait: Annotated[
@@ -414,11 +415,10 @@ def control(
     name: Annotated[
         str | None, typer.Argument(metavar="NAME", help="Of needle: the type to change to, or default.")
     ] = None,
-    connect: Annotated[
-        list[str] | None,
-        typer.Option(metavar="ENDPOINT", help=f"Where the daemon is; default {DEFAULT_ENDPOINT}."),
-    ] = None,
-    key_prefix: Annotated[str, typer.Option(help="As in the daemon's configuration.")] = DEFAULT_PREFIX,
+    connect: Connect = None,
+    config: ConfigFile = None,
+    key_prefix: KeyPrefix = None,
+    client: AsClient = False,
     token_file: Annotated[
         Path | None, typer.Option(help="File with the daemon's control token, where it asks for one.")
     ] = None,
@@ -434,12 +434,23 @@ def control(
     """
     from needletrack.client import Outcome
     from needletrack.client import control as ask
+    from needletrack.config import load_config
     from needletrack.daemon.control import read_token
     from needletrack.publish.control import request_of
+    from needletrack.publish.tls import TlsFiles
 
     token = None if token_file is None else read_token(token_file)
     request = request_of(command, needle=name, token=token, request_id=request_id)
-    reply = ask(rig, request, connect or [DEFAULT_ENDPOINT], key_prefix=key_prefix, timeout_s=timeout)
+    settings = load_config(config).subscribing
+    reply = ask(
+        rig,
+        request,
+        connect or settings.connect,
+        key_prefix=key_prefix or settings.key_prefix,
+        mode="client" if client else settings.mode,
+        tls=TlsFiles.configured(settings.tls),
+        timeout_s=timeout,
+    )
     typer.echo(reply.to_json().decode())
     if reply.outcome is not Outcome.DONE:
         typer.echo(f"needletrack: {command} {reply.outcome.value} ({reply.code}): {reply.detail}", err=True)

@@ -9,7 +9,7 @@ import time
 import weakref
 from collections import deque
 from collections.abc import Iterator, Sequence
-from contextlib import ExitStack, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from enum import StrEnum
 from types import TracebackType
@@ -67,6 +67,7 @@ __all__ = [
     "Subscriber",
     "TrackMessage",
     "control",
+    "control_configured",
 ]
 
 # A track comes for every pair, also an invalid one: this many periods without any are silence.
@@ -559,40 +560,23 @@ class Subscriber:
         return f"the daemon's heart beats ({self._status.state.value}){error}"
 
     def _why_no_daemon(self, timeout_s: float) -> str:
-        where = " or ".join(self._endpoints)
         link = self._link
         if link is None or not link.info.transports():
-            if self._why_not_open:
-                return self._why_not_open
-            whys = (f"{endpoint}: {why}" for endpoint in self._connect if (why := self._why_refused(endpoint)))
-            if why := "; ".join(whys):
-                return f"no link within {timeout_s:g} s: {why}"
-            return (
-                f"nobody answers at {where} within {timeout_s:g} s: is the daemon running, does it listen "
-                "on this endpoint (publishing.listen in its configuration), does a firewall stand between?"
-            )
+            return self._why_not_open or _why_no_link(self._connect, self._listen, self._tls, timeout_s)
+        where = " or ".join(self._endpoints)
         if self._mode == "peer" and link.info.routers_zid():
-            return (
-                f"a router answers at {where}, and routers pass nothing on between two peers: be a client of it "
-                '(subscribing.mode = "client" in the configuration, or --client)'
-            )
+            return _router_and_peers(where)
         others = self._rigs_alive(link)
         alive = f"rigs alive there: {', '.join(others)}" if others else "no other rig is alive there either"
+        rights = ""
+        if self._tls is not None:
+            may = " and ".join(repr(common_name(self.keys.rig, role)) for role in (Role.CONTROLLER, Role.OPERATOR))
+            rights = (
+                f"; and the rights of our certificate: {_ours(self._tls)}, and rig {self.keys.rig!r} tells {may} alone"
+            )
         return (
             f"{where} answers, but no daemon of rig {self.keys.rig!r} within {timeout_s:g} s: "
-            f"check the rig's name and the key prefix {self.keys.prefix!r} ({alive}){self._about_rights()}"
-        )
-
-    def _why_refused(self, endpoint: str) -> str:
-        return "" if self._tls is None else self._tls.why_refused(endpoint)
-
-    def _about_rights(self) -> str:
-        if self._tls is None:
-            return ""
-        return (
-            f"; and the rights of our certificate: {self._tls.certificate} is {name_of(self._tls.check())!r}, and "
-            f"rig {self.keys.rig!r} tells {common_name(self.keys.rig, Role.CONTROLLER)!r} and "
-            f"{common_name(self.keys.rig, Role.OPERATOR)!r} alone"
+            f"check the rig's name and the key prefix {self.keys.prefix!r} ({alive}){rights}"
         )
 
     def _rigs_alive(self, link: _Link) -> list[str]:
@@ -606,31 +590,90 @@ def control(
     connect: Sequence[str] = (DEFAULT_ENDPOINT,),
     *,
     key_prefix: str = DEFAULT_PREFIX,
+    mode: Mode = "peer",
+    tls: TlsFiles | None = None,
     timeout_s: float = 10.0,
 ) -> ControlReply:
     """Ask a rig's daemon for something, and return its answer, whose class belongs to the request's.
 
     Asked again until an answer comes: the request's id sees to it that nothing is done twice. A refusal is an answer
-    (`outcome`). Raises PublishError where none comes in time, or it cannot be read.
+    (`outcome`). mode, tls: as of `Subscriber`; over TLS the operator's certificate alone is answered. Raises
+    PublishError where none comes in time, or it cannot be read.
     """
     keys = RigKeys(rig, key_prefix)
     key, until_s = keys.control(request.command), time.monotonic() + timeout_s
-    reached = False
-    with open_session(connect=connect) as session:
-        while (left_s := until_s - time.monotonic()) > 0:
+    reached = routed = False
+    with _opened_in_time(keys, connect, mode, tls, until_s) as session:
+        while session is not None and (left_s := until_s - time.monotonic()) > 0:
             for reply in session.get(key, payload=request.to_json(), timeout=left_s):
                 if reply.ok is not None:
                     return request.reply_from_json(reply.ok.payload.to_bytes())
             reached = reached or bool(session.info.transports())
+            routed = mode == "peer" and bool(session.info.routers_zid())
             time.sleep(min(ASK_AGAIN_S, left_s))
-    where = " or ".join(connect)
     if not reached:
-        raise PublishError(f"nobody answers at {where} within {timeout_s:g} s: is the daemon running, and there?")
+        raise PublishError(_why_no_link(connect, (), tls, timeout_s))
+    where = " or ".join(connect)
+    if routed:
+        raise PublishError(_router_and_peers(where))
+    rights = "" if tls is None else f" {_ours(tls)}, and {common_name(rig, Role.OPERATOR)!r} alone may command it."
     raise PublishError(
-        f"{where} answers, but nobody on {key} within {timeout_s:g} s: check the rig's name and the key prefix; do the "
-        "access rules let this certificate ask? A replay takes no requests. What was asked may have been done all the "
-        "same: the same request, repeated, is answered with its outcome"
+        f"{where} answers, but nobody on {key} within {timeout_s:g} s: check the rig's name and the key prefix."
+        f"{rights} A replay takes no requests. What was asked may have been done all the same: the same request, "
+        "repeated, is answered with its outcome"
     )
+
+
+def control_configured(
+    rig: str, request: ControlRequest, settings: "SubscribingConfig", *, timeout_s: float = 10.0
+) -> ControlReply:
+    """`control`, as the `[subscribing]` table of a configuration has it."""
+    return control(
+        rig,
+        request,
+        settings.connect,
+        key_prefix=settings.key_prefix,
+        mode=settings.mode,
+        tls=TlsFiles.configured(settings.tls),
+        timeout_s=timeout_s,
+    )
+
+
+@contextmanager
+def _opened_in_time(
+    keys: RigKeys, connect: Sequence[str], mode: Mode, tls: TlsFiles | None, until_s: float
+) -> Iterator[zenoh.Session | None]:
+    """A session; None where nobody answered a client in time."""
+    with ExitStack() as opened:
+        session = None
+        while session is None and time.monotonic() < until_s:
+            try:
+                session = opened.enter_context(open_session(connect=connect, mode=mode, tls=tls, rigs=[keys]))
+            except NobodyAnswers:
+                time.sleep(min(CLIENT_TRIES_EVERY_S, max(until_s - time.monotonic(), 0)))
+        yield session
+
+
+def _why_no_link(connect: Sequence[str], listen: Sequence[str], tls: TlsFiles | None, timeout_s: float) -> str:
+    if tls is not None:
+        whys = (f"{endpoint}: {why}" for endpoint in connect if (why := tls.why_refused(endpoint)))
+        if why := "; ".join(whys):
+            return f"no link within {timeout_s:g} s: {why}"
+    return (
+        f"nobody answers at {' or '.join((*connect, *listen))} within {timeout_s:g} s: is the daemon running, does it "
+        "listen on this endpoint (publishing.listen in its configuration), does a firewall stand between?"
+    )
+
+
+def _router_and_peers(where: str) -> str:
+    return (
+        f"a router answers at {where}, and routers pass nothing on between two peers: be a client of it "
+        '(subscribing.mode = "client" in the configuration, or --client)'
+    )
+
+
+def _ours(tls: TlsFiles) -> str:
+    return f"{tls.certificate} is {name_of(tls.check())!r}"
 
 
 def _pairs_dropped(message: TrackMessage) -> int:

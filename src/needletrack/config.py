@@ -233,7 +233,7 @@ class PublishingConfig(BaseModel):
 
 
 class SubscribingConfig(BaseModel):
-    """Where `needletrack watch` and the Python client find the tracks."""
+    """Where `needletrack watch`, `needletrack control` and the Python client find the daemon."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -259,7 +259,7 @@ class Config(BaseModel):
     drift: DriftParameters = Field(DriftParameters(), description="When a camera counts as moved.")
     pairing: PairingConfig = Field(PairingConfig(), description="Which frames belong together.")
     publishing: PublishingConfig = Field(PublishingConfig(), description="Where the tracks go.")
-    subscribing: SubscribingConfig = Field(SubscribingConfig(), description="Where a subscriber finds the tracks.")
+    subscribing: SubscribingConfig = Field(SubscribingConfig(), description="Where a subscriber finds the daemon.")
     cameras: CamerasSettings = Field(CamerasSettings(), description="The two cameras.")
     recording: RecordingConfig = Field(RecordingConfig(), description="Where recordings go.")
     daemon: DaemonConfig = Field(DaemonConfig(), description="How the daemon lives on its machine.")

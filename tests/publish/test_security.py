@@ -1,7 +1,6 @@
 """What somebody who is not meant to might try: attempted with the protection, and, as it could work, without."""
 
 import os
-import queue
 import re
 import socket
 import subprocess
@@ -12,6 +11,7 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime, timedelta
+from functools import partial
 from ipaddress import ip_address
 from pathlib import Path
 
@@ -27,9 +27,11 @@ from typer.testing import CliRunner
 
 from needletrack.authority import init_security
 from needletrack.cli import app
-from needletrack.client import Freshness, Subscriber
+from needletrack.client import Freshness, Outcome, RedetectReply, RedetectRequest, Subscriber, control
 from needletrack.errors import PublishError
 from needletrack.publish.access import Role
+from needletrack.publish.clock import ClockMessage
+from needletrack.publish.control import ControlDesk, ControlRequest
 from needletrack.publish.keys import RigKeys
 from needletrack.publish.message import StatusMessage
 from needletrack.publish.overlay import OverlayPublisher
@@ -40,7 +42,6 @@ from needletrack.publish.tls import TlsFiles
 from needletrack.router import serve
 
 KEYS = RigKeys("lab")
-CONTROL = "needletrack/lab/control/redetect"
 TRACK, STATUS = example_messages()
 # What has not come by then, while others' came within milliseconds, does not come.
 NEVER_S = 0.4
@@ -61,11 +62,12 @@ def pki(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @dataclass(frozen=True)
 class Scene:
-    """A daemon, and where others meet it: itself, or a router."""
+    """A daemon, and where others meet it: itself, or a router; what it was commanded."""
 
     publisher: ZenohPublisher
     endpoint: str
     tls: TlsFiles | None
+    done: list[ControlRequest]
 
 
 @contextmanager
@@ -86,11 +88,25 @@ def scene(pki: Path | None, *, routed: bool) -> Iterator[Scene]:
         elif routed:
             opened.enter_context(raw_session("router", listen=[endpoint]))
         tls = None if pki is None else files(pki / "lab" / "publisher")
+        done: list[ControlRequest] = []
+
+        def redetect(request: RedetectRequest) -> dict[str, object]:
+            done.append(request)
+            return {"after_sequence": len(done)}
+
+        desk = opened.enter_context(ControlDesk(example_run(), KEYS, {"re-detect": redetect}, lambda request: None))
         ends: dict[str, list[str]] = {"listen": [], "connect": [endpoint]} if routed else {"listen": [endpoint]}
         publisher = opened.enter_context(
-            ZenohPublisher(example_run(), lambda: STATUS, tls=tls, heartbeat_s=0.05, **ends)  # type: ignore[arg-type]
+            ZenohPublisher(
+                example_run(),
+                lambda: STATUS,
+                tls=tls,
+                heartbeat_s=0.05,
+                control=desk.receive,
+                **ends,  # type: ignore[arg-type]
+            )
         )
-        yield Scene(publisher, endpoint, None if pki is None else files(pki / "lab" / "controller"))
+        yield Scene(publisher, endpoint, None if pki is None else files(pki / "lab" / "controller"), done)
 
 
 def intruder(scene: Scene, pki: Path | None, identity: str = "lab/controller") -> zenoh.Session:
@@ -136,26 +152,28 @@ def test_forged_tracks_and_status_reach_nobody(pki: Path, routed: bool, protecte
 
 @EVERY_SCENE
 @BOTH_WAYS
-def test_nobody_else_answers_in_our_place(pki: Path, routed: bool, protected: bool) -> None:
+@pytest.mark.parametrize("key", [KEYS.status, KEYS.clock], ids=["status", "clock"])
+def test_nobody_else_answers_in_our_place(pki: Path, routed: bool, protected: bool, key: str) -> None:
     shown = pki if protected else None
-    forged = STATUS.model_copy(update={"counters": {"forged": 1}}).to_json()
+    forged_status = STATUS.model_copy(update={"counters": {"forged": 1}}).to_json()
+    forged = forged_status if key == KEYS.status else ClockMessage.now(666, 666).to_json()
 
     def answer(query: zenoh.Query) -> None:
         with query:
-            query.reply(KEYS.status, forged)
+            query.reply(key, forged)
 
     with scene(shown, routed=routed) as at, intruder(at, shown) as session, intruder(at, shown) as victim:
-        session.declare_queryable(KEYS.status, answer, complete=True)
-        answers: list[str] = []
+        session.declare_queryable(key, answer, complete=True)
+        answers: list[bytes] = []
 
         def asked() -> bool:
-            replies = victim.get(KEYS.status, target=zenoh.QueryTarget.ALL, timeout=2.0)
-            answers.extend(reply.ok.payload.to_string() for reply in replies if reply.ok is not None)
-            return any("forged" in one for one in answers)
+            replies = victim.get(key, target=zenoh.QueryTarget.ALL, timeout=2.0)
+            answers.extend(reply.ok.payload.to_bytes() for reply in replies if reply.ok is not None)
+            return forged in answers
 
         assert eventually(asked, NEVER_S if protected else WAIT_S) is not protected
         if protected:
-            assert any("forged" not in one for one in answers)
+            assert any(one != forged for one in answers)
 
 
 @EVERY_SCENE
@@ -176,30 +194,79 @@ def test_nobody_else_claims_that_the_daemon_lives(pki: Path, routed: bool, prote
 
 
 @EVERY_SCENE
-def test_each_role_does_what_it_may(pki: Path, routed: bool) -> None:
-    def control(query: zenoh.Query) -> None:
-        with query:
-            query.reply(CONTROL, "done")
+def test_the_operator_commands_and_nobody_else(pki: Path, tmp_path: Path, routed: bool) -> None:
+    init_security(tmp_path, "lab")
 
-    with scene(pki, routed=routed) as at, ExitStack() as opened:
-        # Another session with the daemon's certificate: at the router, or met directly.
-        at_it = at if routed else replace(at, endpoint=f"tls/127.0.0.1:{free_port()}")
-        ends: dict[str, list[str]] = {"connect" if routed else "listen": [at_it.endpoint]}
-        daemon = opened.enter_context(open_session(tls=files(pki / "lab" / "publisher"), rigs=[KEYS], **ends))  # type: ignore[arg-type]
-        daemon.declare_queryable(CONTROL, control)
-        roles = [f"lab/{role.value}" for role in (Role.OPERATOR, Role.CONTROLLER)]
-        operator, controller = (opened.enter_context(intruder(at_it, pki, role)) for role in roles)
+    with scene(pki, routed=routed) as at:
 
-        def answers(session: zenoh.Session) -> list[str]:
-            return [reply.ok.payload.to_string() for reply in session.get(CONTROL, timeout=1.0) if reply.ok is not None]
+        def ask(folder: Path, timeout_s: float) -> RedetectReply:
+            request = RedetectRequest()
+            reply = control(
+                "lab",
+                request,
+                [at.endpoint],
+                mode="client" if routed else "peer",
+                tls=files(folder),
+                timeout_s=timeout_s,
+            )
+            assert isinstance(reply, RedetectReply)
+            return reply
 
-        assert eventually(lambda: answers(operator) == ["done"])
-        assert answers(controller) == []
-        daemon_at = (opened.enter_context(intruder(at, pki, role)) for role in roles)
-        for session in daemon_at:
-            heartbeats: queue.SimpleQueue[zenoh.Sample] = queue.SimpleQueue()
-            session.declare_subscriber(KEYS.status, heartbeats.put)
-            heartbeats.get(timeout=WAIT_S)
+        assert ask(pki / "lab" / "operator", WAIT_S).outcome is Outcome.DONE
+        for folder, told in (
+            (pki / "lab" / "controller", "is 'lab.controller', and 'lab.operator' alone may command it"),
+            (pki / "other" / "operator", "is 'other.operator', and 'lab.operator' alone may command it"),
+            # Of an authority that says the same names.
+            (tmp_path / "lab" / "operator", "is not of the authority in"),
+        ):
+            with pytest.raises(PublishError, match=re.escape(told)):
+                ask(folder, 1.0)
+        with pytest.raises(PublishError, match="TLS needs an authority"):
+            control("lab", RedetectRequest(), [at.endpoint], timeout_s=1.0)
+        assert len(at.done) == 1
+        assert ask(pki / "lab" / "operator", WAIT_S).after_sequence == 2
+
+
+@EVERY_SCENE
+@BOTH_WAYS
+def test_who_keeps_no_rules_commands_nothing_either(pki: Path, routed: bool, protected: bool) -> None:
+    """The daemon and the router refuse: the asker's own rules are not what is relied on."""
+    shown = pki if protected else None
+    with scene(shown, routed=routed) as at, ExitStack() as opened:
+        operator = opened.enter_context(intruder(at, shown, "lab/operator"))
+        others = [opened.enter_context(intruder(at, shown, who)) for who in ("lab/controller", "other/operator")]
+
+        def answers(session: zenoh.Session, key: str) -> list[str]:
+            replies = session.get(
+                key, payload=RedetectRequest().to_json(), target=zenoh.QueryTarget.ALL, timeout=NEVER_S
+            )
+            return [str(reply.ok.key_expr) for reply in replies if reply.ok is not None]
+
+        assert eventually(lambda: answers(operator, KEYS.control("re-detect")))
+        done = len(at.done)
+        if not protected:
+            for session in others:
+                assert eventually(partial(answers, session, KEYS.control("re-detect")))
+            assert len(at.done) > done
+            return
+        for session in others:
+            for key in (KEYS.control("re-detect"), KEYS.control("*"), f"{KEYS.root}/**"):
+                assert KEYS.control("re-detect") not in answers(session, key)
+        assert len(at.done) == done
+
+
+@EVERY_SCENE
+@BOTH_WAYS
+@pytest.mark.parametrize("role", [Role.CONTROLLER, Role.OPERATOR])
+def test_clocks_are_compared_over_every_link(pki: Path, routed: bool, protected: bool, role: Role) -> None:
+    with scene(pki if protected else None, routed=routed) as at:
+        tls = files(pki / "lab" / role.value) if protected else None
+        with Subscriber("lab", [at.endpoint], mode="client" if routed else "peer", tls=tls) as subscriber:
+            assert eventually(lambda: subscriber.clock is not None)
+            found = subscriber.clock
+    assert found is not None
+    # It is one clock.
+    assert abs(found.ours_minus_daemons_ms) <= found.uncertainty_ms
 
 
 @EVERY_SCENE
@@ -219,7 +286,8 @@ def test_who_is_not_of_the_rig_reads_nothing(pki: Path, routed: bool, identity: 
             assert eventually(lambda: len(ours) >= 5)
             time.sleep(NEVER_S)
             assert theirs == []
-            assert [reply for reply in session.get(KEYS.status, timeout=0.5) if reply.ok is not None] == []
+            for key in (KEYS.status, KEYS.clock):
+                assert [reply for reply in session.get(key, timeout=0.5) if reply.ok is not None] == []
             assert [reply for reply in session.liveliness().get(KEYS.alive, timeout=0.5) if reply.ok is not None] == []
 
 

@@ -10,6 +10,7 @@ import sys
 import threading
 import time
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -20,9 +21,19 @@ import pytest
 from tests.publish.network import WAIT_S, eventually, free_port, raw_session
 from tests.publish.relay import Relay
 
-from needletrack.client import Freshness, Received, Subscriber
+from needletrack.client import (
+    Freshness,
+    Outcome,
+    Received,
+    RedetectRequest,
+    Subscriber,
+    control,
+    control_configured,
+)
 from needletrack.config import Config, load_config
 from needletrack.errors import PublishError
+from needletrack.publish.control import ControlDesk
+from needletrack.publish.keys import RigKeys
 from needletrack.publish.publisher import ZenohPublisher
 from needletrack.publish.schema import example_messages, example_run
 from needletrack.publish.session import DEFAULT_ENDPOINT, open_endpoints, open_session
@@ -42,7 +53,7 @@ def local(name: str, folder: Path, ports: dict[int, int]) -> Path:
     return path
 
 
-def publisher_of(config: Config, rig: str = "lab") -> ZenohPublisher:
+def publisher_of(config: Config, rig: str = "lab", desk: ControlDesk | None = None) -> ZenohPublisher:
     settings = config.publishing
     return ZenohPublisher(
         replace(example_run(), rig=rig),
@@ -50,6 +61,7 @@ def publisher_of(config: Config, rig: str = "lab") -> ZenohPublisher:
         listen=settings.listen,
         connect=settings.connect,
         heartbeat_s=0.1,
+        control=None if desk is None else desk.receive,
     )
 
 
@@ -216,6 +228,27 @@ def test_a_peer_at_a_router_is_told_to_be_a_client(tmp_path: Path) -> None:
         pytest.raises(PublishError, match="routers pass nothing on between two peers: be a client"),
     ):
         subscriber.wait_for_daemon(0.5)
+
+
+def test_a_command_waits_for_a_late_router_and_is_done_once(tmp_path: Path) -> None:
+    port, done = free_port(), threading.Event()
+    config = load_config(local("routed.toml", tmp_path, {7447: port}))
+
+    def redetect(request: RedetectRequest) -> dict[str, object]:
+        assert not done.is_set()
+        done.set()
+        return {"after_sequence": 7}
+
+    desk = ControlDesk(example_run(), RigKeys("lab"), {"re-detect": redetect}, lambda request: None)
+    with publisher_of(config, desk=desk), desk, ThreadPoolExecutor(1) as pool:
+        with pytest.raises(PublishError, match=f"nobody answers at tcp/127.0.0.1:{port} within 0.2 s"):
+            control_configured("lab", RedetectRequest(), config.subscribing, timeout_s=0.2)
+        asking = pool.submit(control_configured, "lab", RedetectRequest(), config.subscribing, timeout_s=WAIT_S)
+        assert not asking.done()
+        with router_here(local("router.json5", tmp_path, {7447: port})):
+            assert asking.result(WAIT_S).outcome is Outcome.DONE
+            with pytest.raises(PublishError, match="routers pass nothing on between two peers: be a client"):
+                control("lab", RedetectRequest(), config.subscribing.connect, timeout_s=0.3)
 
 
 def test_a_client_listens_on_nothing() -> None:

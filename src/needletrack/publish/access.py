@@ -33,7 +33,9 @@ def common_name(rig: str, role: Role) -> str:
 def access_control(rigs: Sequence[RigKeys]) -> dict[str, Any]:
     """Zenoh's `access_control` for these rigs: each publisher gives on its own rig's keys and nobody else does.
 
-    Controllers read tracks, heartbeats, overlays and liveliness; operators query the rig's `control` keys as well.
+    Controllers read tracks, heartbeats, overlays and liveliness, and ask for the status and the clock. Operators query
+    the rig's `control` keys as well; controllers may not: a loop that moves a robot has no need to, and one that was
+    taken over can then neither stop a recording nor change the needle under its own pose.
     """
     rules: list[dict[str, Any]] = []
     subjects = [{"id": "router", "cert_common_names": [ROUTER_NAME]}]

@@ -28,6 +28,8 @@ FLOORS: dict[str, float] = {
     "pictures": 3.4,
     "recording": 3.5,
     "client": 3.5,
+    "authority": 3.5,
+    "router": 3.5,
     "scoring": 3.5,
     "auditing": 3.6,
     "service": 4.0,

@@ -1,12 +1,17 @@
 """Following in this process, audits in another: what is found there is gone on from here."""
 
+import multiprocessing
 import os
 import signal
+import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from multiprocessing.process import BaseProcess
 
 import numpy as np
 import pytest
+from tests.recording.small_recording import SIZE_PX, small_rig
 from tests.tracking.scenes import RIG, WORLDS, Scene, scene, seen_at
 
 from needletrack.auditing import AuditedTracker
@@ -115,3 +120,60 @@ def test_when_the_other_process_dies_tracking_goes_on() -> None:
             assert pairs.see(scene("dark")).status is Status.OK
         assert tracker.failures == 1
         assert pairs.see(scene("dark")).status is Status.OK
+
+
+def second_processes() -> set[BaseProcess]:
+    return {process for process in multiprocessing.active_children() if process.name == "needletrack-audit"}
+
+
+def empty(number: int = 0) -> StereoPair:
+    frame = Frame(np.zeros(SIZE_PX[::-1], np.uint8), number * 10_000_000)
+    return StereoPair(frame, frame, number)
+
+
+def test_the_one_before_is_closed_by_who_calls_the_next_one_first() -> None:
+    rig, threads = small_rig(), []
+
+    class Told(AuditedTracker):
+        def close(self) -> None:
+            threads.append(threading.current_thread().name)
+            super().close()
+
+    with Told(rig, P) as first, ThreadPoolExecutor(1, "tracking") as tracking:
+        assert tracking.submit(first, empty(), None).result(WAIT_S).status is Status.INVALID
+        second = Told(rig, P, after=first).__enter__()
+        # Nobody called the second one before there was a third.
+        third = Told(rig, P, after=second).__enter__()
+        assert (len(second_processes()), threads) == (3, [])
+        assert tracking.submit(third, empty(1), None).result(WAIT_S).status is Status.INVALID
+        assert threads == ["tracking_0"] * 2
+        assert len(second_processes()) == 1
+        third.close()
+        assert second_processes() == set()
+        third.close()
+
+
+def test_one_that_was_never_called_closes_those_before() -> None:
+    rig = small_rig()
+    first = AuditedTracker(rig, P).__enter__()
+    second = AuditedTracker(rig, P, after=first).__enter__()
+    assert len(second_processes()) == 2
+    second.close()
+    assert second_processes() == set()
+
+
+@pytest.mark.parametrize("waits", [True, False])
+def test_a_second_process_that_dies_as_it_starts_ends_no_tracking(waits: bool) -> None:
+    with AuditedTracker(small_rig(), P) as tracker:
+        (process,) = second_processes()
+        process.kill()
+        process.join(WAIT_S)
+        if waits:
+            assert tracker.warm_up()
+        track = None
+        for number in range(10):
+            track = tracker(empty(number), track)
+        assert track is not None
+        assert track.status is Status.INVALID
+        assert tracker.failures == 1
+    assert second_processes() == set()

@@ -45,11 +45,13 @@ copyreg.pickle(MappingProxyType, lambda proxy: (_read_only, (dict(proxy),)))
 class AuditedTracker:
     """Our method, one pair after another, of a rig; as a context audits and searches run beside it, else in line.
 
-    The first pair, and each that has no track before it, is searched here and now.
+    The first pair, and each that has no track before it, is searched here and now. after: the tracker in whose place
+    this one comes; the thread that calls both closes it with the first pair given to this one, or `close` does.
     """
 
-    def __init__(self, rig: Rig, parameters: TrackingParameters) -> None:
+    def __init__(self, rig: Rig, parameters: TrackingParameters, *, after: "AuditedTracker | None" = None) -> None:
         self._rig, self._parameters = rig, parameters
+        self._before = after
         self._auditor: _Auditor | None = None
         self._is_open, self._failed_at_s = False, 0.0
         self._since_audit = 0
@@ -66,30 +68,39 @@ class AuditedTracker:
         self.close()
 
     def close(self) -> None:
-        """End the second process; what it is at is dropped."""
+        """End the second process, and that of the tracker before; what they are at is dropped. May be called twice."""
         self._is_open = False
         self._end()
+        self._close_the_one_before()
+
+    def _close_the_one_before(self) -> None:
+        if self._before is not None:
+            self._before.close()
+            self._before = None
 
     def _end(self) -> None:
         if self._auditor is not None:
             self._auditor.close()
             self._auditor = None
 
-    def warm_up(self) -> None:
-        """Wait until the second process is there."""
-        if self._auditor is not None:
-            try:
-                self._auditor.wait(_STARTS_WITHIN_S)
-            except (EOFError, OSError):
-                self._give_up()
-
     @property
     def pid(self) -> int | None:
         """The second process, while there is one."""
         return None if self._auditor is None else self._auditor.pid
 
+    def warm_up(self, within_s: float = _STARTS_WITHIN_S) -> bool:
+        """Wait until the second process is there; whether it is, or there is none to wait for."""
+        if self._auditor is None:
+            return True
+        try:
+            return self._auditor.wait(within_s)
+        except (EOFError, OSError):
+            self._give_up()
+            return True
+
     def __call__(self, pair: StereoPair, previous: NeedleTrack | None) -> NeedleTrack:
         """The track of this pair; previous: that of the pair before, None to start without memory."""
+        self._close_the_one_before()
         if not self._is_open:
             return track_pair(pair, self._rig, self._parameters, previous)
         found = self._found()
@@ -136,7 +147,7 @@ class AuditedTracker:
         try:
             if self._auditor.look(pair, track):
                 self._since_audit = 0
-        except OSError:
+        except (EOFError, OSError):
             self._give_up()
 
     def _give_up(self) -> None:
@@ -171,11 +182,12 @@ class _Auditor:
         """Its number."""
         return self._process.pid
 
-    def wait(self, seconds: float) -> None:
-        """Wait for it to be there, at most so long."""
+    def wait(self, seconds: float) -> bool:
+        """Wait for it to be there, at most so long; whether it is."""
         if not self._is_up and self._pipe.poll(seconds):
             self._pipe.recv()
             self._is_up = True
+        return self._is_up
 
     def look(self, pair: StereoPair, track: NeedleTrack) -> bool:
         """Give it a pair and the track that was followed to it; False where it is still at another one."""

@@ -51,6 +51,8 @@ rig_app = typer.Typer(no_args_is_help=True, help="Rig files: both cameras and th
 config_app = typer.Typer(no_args_is_help=True, help="The configuration file.")
 app.add_typer(rig_app, name="rig")
 app.add_typer(config_app, name="config")
+security_app = typer.Typer(no_args_is_help=True, help="Who may read, publish and command: certificates and rules.")
+app.add_typer(security_app, name="security")
 
 P = ParamSpec("P")
 
@@ -69,6 +71,15 @@ RigFile = Annotated[
 Independent = Annotated[
     bool, typer.Option("--independent", help="Start every pair without memory: for recordings of stills.")
 ]
+Connect = Annotated[
+    list[str] | None,
+    typer.Option(
+        metavar="ENDPOINT",
+        help=f"Where the daemon or its router is; else subscribing.connect, by default {DEFAULT_ENDPOINT}.",
+    ),
+]
+KeyPrefix = Annotated[str | None, typer.Option(help="As in the daemon's; else subscribing.key_prefix.")]
+AsClient = Annotated[bool, typer.Option("--client", help="Be a client, of a router; else as subscribing.mode.")]
 Start = Annotated[int, typer.Option(min=0, help="First pair, from 0.")]
 End = Annotated[int | None, typer.Option(min=0, help="The pair after the last; all without it.")]
 Method = Annotated[Literal["curve", "reference"], typer.Option(help="Ours, or that of 2017.")]
@@ -223,6 +234,7 @@ def run(rig: RunRig = None, config: ConfigFile = None) -> None:
     from needletrack.config import load_config
     from needletrack.daemon.logs import logged
     from needletrack.daemon.run import Daemon, exit_code
+    from needletrack.publish.session import is_still_closing
     from needletrack.terminal import Interruption, described_skew
     from needletrack.terminal import described as described_run
 
@@ -239,6 +251,9 @@ def run(rig: RunRig = None, config: ConfigFile = None) -> None:
     typer.echo(described_skew(summary.skew), err=True)
     if summary.recorded is not None:
         typer.echo(f"  recorded: {summary.recorded} pairs, not recorded: {summary.unrecorded}", err=True)
+    if is_still_closing():
+        # All is done and told; Zenoh would keep the process for up to 10 s, for a subscriber that hangs.
+        os._exit(0)
 
 
 @app.command()
@@ -350,11 +365,10 @@ def doctor(
 @plain_errors
 def watch(
     rig: Annotated[str, typer.Argument(metavar="RIG", help="The rig's name, which is part of the key.")],
-    connect: Annotated[
-        list[str] | None,
-        typer.Option(metavar="ENDPOINT", help=f"Where the daemon is; default {DEFAULT_ENDPOINT}."),
-    ] = None,
-    key_prefix: Annotated[str, typer.Option(help="As in the daemon's configuration.")] = DEFAULT_PREFIX,
+    connect: Connect = None,
+    config: ConfigFile = None,
+    key_prefix: KeyPrefix = None,
+    client: AsClient = False,
     until_gone: Annotated[bool, typer.Option("--until-gone", help="End when the daemon does.")] = False,
     count: Annotated[int | None, typer.Option(min=1, help="End after so many tracks.")] = None,
     wait: Annotated[
@@ -367,13 +381,18 @@ def watch(
     report: Annotated[Path | None, typer.Option(help="Write the summary there, as JSON.")] = None,
 ) -> None:
     """Show a rig's tracks as they arrive, until Ctrl-C, with what is fresh, missing, and how far the clocks differ."""
+    from needletrack.config import load_config
+    from needletrack.publish.tls import TlsFiles
     from needletrack.terminal import write_summary
     from needletrack.watch import watch as watch_tracks
 
+    settings = load_config(config).subscribing
     summary = watch_tracks(
         rig,
-        connect or [DEFAULT_ENDPOINT],
-        key_prefix=key_prefix,
+        connect or settings.connect,
+        key_prefix=key_prefix or settings.key_prefix,
+        mode="client" if client else settings.mode,
+        tls=TlsFiles.configured(settings.tls),
         until_gone=until_gone,
         count=count,
         wait_s=wait,
@@ -396,11 +415,10 @@ def control(
     name: Annotated[
         str | None, typer.Argument(metavar="NAME", help="Of needle: the type to change to, or default.")
     ] = None,
-    connect: Annotated[
-        list[str] | None,
-        typer.Option(metavar="ENDPOINT", help=f"Where the daemon is; default {DEFAULT_ENDPOINT}."),
-    ] = None,
-    key_prefix: Annotated[str, typer.Option(help="As in the daemon's configuration.")] = DEFAULT_PREFIX,
+    connect: Connect = None,
+    config: ConfigFile = None,
+    key_prefix: KeyPrefix = None,
+    client: AsClient = False,
     token_file: Annotated[
         Path | None, typer.Option(help="File with the daemon's control token, where it asks for one.")
     ] = None,
@@ -416,16 +434,85 @@ def control(
     """
     from needletrack.client import Outcome
     from needletrack.client import control as ask
+    from needletrack.config import load_config
     from needletrack.daemon.control import read_token
     from needletrack.publish.control import request_of
+    from needletrack.publish.tls import TlsFiles
 
     token = None if token_file is None else read_token(token_file)
     request = request_of(command, needle=name, token=token, request_id=request_id)
-    reply = ask(rig, request, connect or [DEFAULT_ENDPOINT], key_prefix=key_prefix, timeout_s=timeout)
+    settings = load_config(config).subscribing
+    reply = ask(
+        rig,
+        request,
+        connect or settings.connect,
+        key_prefix=key_prefix or settings.key_prefix,
+        mode="client" if client else settings.mode,
+        tls=TlsFiles.configured(settings.tls),
+        timeout_s=timeout,
+    )
     typer.echo(reply.to_json().decode())
     if reply.outcome is not Outcome.DONE:
         typer.echo(f"needletrack: {command} {reply.outcome.value} ({reply.code}): {reply.detail}", err=True)
         raise typer.Exit(1 if reply.outcome is Outcome.FAILED else 2)
+
+
+@app.command()
+@plain_errors
+def router(
+    path: Annotated[Path, typer.Argument(metavar="FILE", help="Zenoh's own configuration, JSON5, of mode router.")],
+) -> None:
+    """Route between daemons and subscribers until SIGTERM or Ctrl-C, where no zenohd is at hand."""
+    from needletrack.router import serve
+    from needletrack.terminal import Interruption
+
+    with Interruption() as interruption:
+        serve(path, interruption.stop, lambda endpoints: typer.echo(f"routing on {', '.join(endpoints)}", err=True))
+
+
+@security_app.command("init")
+@plain_errors
+def security_init(
+    folder: Annotated[Path, typer.Argument(metavar="DIR", help="New folder, or one to which a rig is added.")],
+    rig: Annotated[str, typer.Option(help="The rig's name, as in its file.")],
+    host: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="Name or address by which others reach the daemon or the router; may be repeated. "
+            "Default: 127.0.0.1 and localhost, this machine alone."
+        ),
+    ] = None,
+    key_prefix: Annotated[str, typer.Option(help="As publishing.key_prefix.")] = DEFAULT_PREFIX,
+    days: Annotated[int, typer.Option(min=1, max=825, help="The certificates are valid for so long.")] = 90,
+    port: Annotated[int, typer.Option(min=1, max=65534, help="Of tracks; pictures have the next one.")] = 7447,
+    renew: Annotated[bool, typer.Option("--renew", help="Replace the rig's and the router's certificates.")] = False,
+) -> None:
+    """Make a TEST authority, a certificate for each of the rig's roles, and the access rules from its name.
+
+    A folder a role: DIR/RIG/publisher, controller, operator, and DIR/router, each with what one machine needs.
+    """
+    from needletrack.authority import NOT_FOR_A_HOSPITAL, init_security
+
+    hosts = host or ["127.0.0.1", "localhost"]
+    for issued in init_security(folder, rig, hosts=hosts, key_prefix=key_prefix, days=days, port=port, renew=renew):
+        typer.echo(f"{issued.name:32} {issued.folder}")
+    typer.echo(f"\n{NOT_FOR_A_HOSPITAL}")
+
+
+@security_app.command("list")
+@plain_errors
+def security_list(
+    folder: Annotated[Path, typer.Argument(metavar="DIR", help="Folder that `security init` made.")],
+) -> None:
+    """List the certificates of a folder, and how long each is valid. Exit code 1 where one has expired."""
+    from needletrack.authority import expiries
+
+    now, expired = datetime.now(UTC), False
+    for path, name, until in expiries(folder):
+        left = f"{(until - now).days} days left" if until > now else "EXPIRED: `needletrack security init ... --renew`"
+        typer.echo(f"{name:32} until {until:%Y-%m-%d %H:%M} UTC, {left}  {path}")
+        expired |= until <= now
+    raise typer.Exit(1 if expired else 0)
 
 
 @rig_app.command("show")

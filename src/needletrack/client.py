@@ -9,15 +9,16 @@ import time
 import weakref
 from collections import deque
 from collections.abc import Iterator, Sequence
-from contextlib import ExitStack, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from enum import StrEnum
 from types import TracebackType
-from typing import Self
+from typing import TYPE_CHECKING, Any, NamedTuple, Self
 
 import zenoh
 
 from needletrack.errors import PublishError
+from needletrack.publish.access import Role, common_name
 from needletrack.publish.clock import ClockDifference, ClockFilter, ClockMessage, Question
 from needletrack.publish.control import (
     ControlReply,
@@ -36,8 +37,12 @@ from needletrack.publish.control import (
 )
 from needletrack.publish.keys import DEFAULT_PREFIX, RigKeys
 from needletrack.publish.message import StatusMessage, TrackMessage
-from needletrack.publish.session import DEFAULT_ENDPOINT, direct, open_session
+from needletrack.publish.session import DEFAULT_ENDPOINT, Mode, NobodyAnswers, direct, open_session
+from needletrack.publish.tls import TlsFiles, name_of
 from needletrack.records import DropReason
+
+if TYPE_CHECKING:
+    from needletrack.config import SubscribingConfig
 
 __all__ = [
     "ClockDifference",
@@ -62,6 +67,7 @@ __all__ = [
     "Subscriber",
     "TrackMessage",
     "control",
+    "control_configured",
 ]
 
 # A track comes for every pair, also an invalid one: this many periods without any are silence.
@@ -75,6 +81,8 @@ CLOCK_QUESTIONS_AT_FIRST = 4
 QUESTION_TIMEOUT_S = 1.0
 # A session needs a moment to meet the daemon, and to learn what it answers.
 ASK_AGAIN_S = 0.05
+# A client cannot open before its router is there (zenoh 1.10): it is tried again, as often as Zenoh would.
+CLIENT_TRIES_EVERY_S = 0.5
 
 # Single frames: they never became a pair, and so never had a number that could be missing.
 FRAME_DROPS = frozenset(
@@ -174,14 +182,24 @@ class _Sample:
     received_monotonic_ns: int
 
 
+class _Link(NamedTuple):
+    """What is asked of an open session later."""
+
+    info: zenoh.SessionInfo
+    liveliness: zenoh.Liveliness
+    status_query: zenoh.Querier
+    clock_query: zenoh.Querier
+
+
 class Subscriber:
     """Receives one rig's tracks; every method may be called from any thread.
 
     max_age_s: an older track is stale. silent_after_s: silence is noticed after it (None: five periods
     of the rate seen, 0.05 s at least, so within 0.1 s at 60 Hz; three heartbeats that are due). capacity:
     tracks kept for `next` and iteration; the oldest is dropped and counted. It is no error if the daemon is
-    not there yet: `health` says never_seen, and it is found when it comes. Raises PublishError for a malformed
-    endpoint or rig name.
+    not there yet: `health` says never_seen, and it is found when it comes. mode: "client" where `connect` names
+    a router, which passes nothing on between two peers. tls: our part of the link's TLS. Raises PublishError for a
+    malformed endpoint or rig name, and a file of tls that cannot be used.
     """
 
     def __init__(
@@ -194,6 +212,8 @@ class Subscriber:
         max_age_s: float = 0.1,
         silent_after_s: float | None = None,
         capacity: int = 64,
+        mode: Mode = "peer",
+        tls: TlsFiles | None = None,
     ) -> None:
         self.keys = RigKeys(rig, key_prefix)
         self._endpoints = (*connect, *listen)
@@ -217,25 +237,70 @@ class Subscriber:
         self._alive: bool | None = None
         self._status: StatusMessage | None = None
         self._status_monotonic_ns = 0
-        with ExitStack() as opened:
-            session = opened.enter_context(open_session(listen, connect))
-            # The session object itself is left alone from here on: closing it fails ("Already borrowed")
-            # while another thread calls a method of it.
-            self._info = session.info
-            self._liveliness = session.liveliness()
-            self._status_query = session.declare_querier(self.keys.status, timeout=QUESTION_TIMEOUT_S)
-            self._clock_query = session.declare_querier(
-                self.keys.clock,
-                timeout=QUESTION_TIMEOUT_S,
-                congestion_control=zenoh.CongestionControl.DROP,
-                priority=zenoh.Priority.INTERACTIVE_HIGH,
-                express=True,
+        self._tls, self._mode, self._listen, self._connect = tls, mode, tuple(listen), tuple(connect)
+        self._link: _Link | None = None
+        self._why_not_open = ""
+        opened = ExitStack()
+        # A program that ends without `close` closes the session all the same.
+        self._close_session = weakref.finalize(self, opened.close)
+        try:
+            self._open(opened)
+        except NobodyAnswers:
+            threading.Thread(target=self._open_when_answered, args=(opened,), daemon=True).start()
+
+    @classmethod
+    def configured(cls, rig: str, settings: "SubscribingConfig", **options: Any) -> Self:
+        """As the `[subscribing]` table of a configuration has it; options: the others of the constructor."""
+        return cls(
+            rig,
+            settings.connect,
+            key_prefix=settings.key_prefix,
+            mode=settings.mode,
+            tls=TlsFiles.configured(settings.tls),
+            **options,
+        )
+
+    def _open(self, opened: ExitStack) -> None:
+        with ExitStack() as opening:
+            session = opening.enter_context(
+                open_session(self._listen, self._connect, mode=self._mode, tls=self._tls, rigs=[self.keys])
             )
+            with self._changed:
+                if self._closed:
+                    return
+                # The session object itself is left alone from here on: closing it fails ("Already borrowed")
+                # while another thread calls a method of it.
+                link = _Link(
+                    session.info,
+                    session.liveliness(),
+                    session.declare_querier(self.keys.status, timeout=QUESTION_TIMEOUT_S),
+                    session.declare_querier(
+                        self.keys.clock,
+                        timeout=QUESTION_TIMEOUT_S,
+                        congestion_control=zenoh.CongestionControl.DROP,
+                        priority=zenoh.Priority.INTERACTIVE_HIGH,
+                        express=True,
+                    ),
+                )
+                self._link = link
             session.declare_subscriber(self.keys.track, direct(self._on_track))
             session.declare_subscriber(self.keys.status, direct(self._on_status))
-            self._liveliness.declare_subscriber(self.keys.alive, direct(self._on_liveliness), history=True)
-            # A program that ends without `close` closes the session all the same.
-            self._close_session = weakref.finalize(self, opened.pop_all().close)
+            link.liveliness.declare_subscriber(self.keys.alive, direct(self._on_liveliness), history=True)
+            opened.push(opening.pop_all())
+        if self._closed:
+            opened.close()
+
+    def _open_when_answered(self, opened: ExitStack) -> None:
+        while not self._closed:
+            try:
+                self._open(opened)
+            except NobodyAnswers:
+                time.sleep(CLIENT_TRIES_EVERY_S)
+            except PublishError as error:  # told by `health`, and by who waits for the daemon
+                self._why_not_open = str(error)
+                return
+            else:
+                return
 
     def __enter__(self) -> Self:
         return self
@@ -334,8 +399,9 @@ class Subscriber:
     def _ask_the_time(self) -> None:
         """Send one question; its answer is taken in Zenoh's thread."""
         with self._changed:
-            if self._closed:
-                return
+            closed, link = self._closed, self._link
+        if closed or link is None:
+            return
         asked = Question(time.time_ns(), time.monotonic_ns())
 
         def take(reply: zenoh.Reply) -> None:
@@ -352,7 +418,7 @@ class Subscriber:
                 self._clock.add(asked, answer, answered_ns)
 
         with suppress(zenoh.ZError):  # closed between the check and this line
-            self._clock_query.get(direct(take))
+            link.clock_query.get(direct(take))
 
     def _on_status_reply(self, reply: zenoh.Reply) -> None:
         if reply.ok is not None:
@@ -384,11 +450,11 @@ class Subscriber:
                 self._status_monotonic_ns = 0
                 self._clock.forget()
             self._changed.notify_all()
-            closed = self._closed
-        if alive and not closed:
+            closed, link = self._closed, self._link
+        if alive and not closed and link is not None:
             # A late joiner has the status at once, not at the next heartbeat.
             with suppress(zenoh.ZError):  # closed between the check and this line
-                self._status_query.get(direct(self._on_status_reply))
+                link.status_query.get(direct(self._on_status_reply))
             for _ in range(CLOCK_QUESTIONS_AT_FIRST):
                 self._ask_the_time()
 
@@ -447,7 +513,7 @@ class Subscriber:
             return Health(Freshness.GONE, "the daemon stopped, or the link to it broke", age_ms)
         if self._latest is None or age_ms is None:
             if self._alive is None and self._undecodable == 0:
-                reason = f"no daemon for rig {self.keys.rig!r} has been seen yet"
+                reason = self._why_not_open or f"no daemon for rig {self.keys.rig!r} has been seen yet"
                 return Health(Freshness.NEVER_SEEN, reason, None)
             return Health(Freshness.SILENT, f"no track yet; {self._daemon_says()}", None)
         silence_s = (time.monotonic_ns() - self._latest.received_monotonic_ns) / 1e9
@@ -494,21 +560,27 @@ class Subscriber:
         return f"the daemon's heart beats ({self._status.state.value}){error}"
 
     def _why_no_daemon(self, timeout_s: float) -> str:
+        link = self._link
+        if link is None or not link.info.transports():
+            return self._why_not_open or _why_no_link(self._connect, self._listen, self._tls, timeout_s)
         where = " or ".join(self._endpoints)
-        if not self._info.transports():
-            return (
-                f"nobody answers at {where} within {timeout_s:g} s: is the daemon running, does it listen "
-                "on this endpoint (publishing.listen in its configuration), does a firewall stand between?"
-            )
-        others = self._rigs_alive()
+        if self._mode == "peer" and link.info.routers_zid():
+            return _router_and_peers(where)
+        others = self._rigs_alive(link)
         alive = f"rigs alive there: {', '.join(others)}" if others else "no other rig is alive there either"
+        rights = ""
+        if self._tls is not None:
+            may = " and ".join(repr(common_name(self.keys.rig, role)) for role in (Role.CONTROLLER, Role.OPERATOR))
+            rights = (
+                f"; and the rights of our certificate: {_ours(self._tls)}, and rig {self.keys.rig!r} tells {may} alone"
+            )
         return (
             f"{where} answers, but no daemon of rig {self.keys.rig!r} within {timeout_s:g} s: "
-            f"check the rig's name and the key prefix {self.keys.prefix!r} ({alive})"
+            f"check the rig's name and the key prefix {self.keys.prefix!r} ({alive}){rights}"
         )
 
-    def _rigs_alive(self) -> list[str]:
-        replies = self._liveliness.get(f"{self.keys.prefix}/*/alive", timeout=1.0)
+    def _rigs_alive(self, link: _Link) -> list[str]:
+        replies = link.liveliness.get(f"{self.keys.prefix}/*/alive", timeout=1.0)
         return sorted({str(reply.ok.key_expr).split("/")[-2] for reply in replies if reply.ok is not None})
 
 
@@ -518,31 +590,90 @@ def control(
     connect: Sequence[str] = (DEFAULT_ENDPOINT,),
     *,
     key_prefix: str = DEFAULT_PREFIX,
+    mode: Mode = "peer",
+    tls: TlsFiles | None = None,
     timeout_s: float = 10.0,
 ) -> ControlReply:
     """Ask a rig's daemon for something, and return its answer, whose class belongs to the request's.
 
     Asked again until an answer comes: the request's id sees to it that nothing is done twice. A refusal is an answer
-    (`outcome`). Raises PublishError where none comes in time, or it cannot be read.
+    (`outcome`). mode, tls: as of `Subscriber`; over TLS the operator's certificate alone is answered. Raises
+    PublishError where none comes in time, or it cannot be read.
     """
     keys = RigKeys(rig, key_prefix)
     key, until_s = keys.control(request.command), time.monotonic() + timeout_s
-    reached = False
-    with open_session(connect=connect) as session:
-        while (left_s := until_s - time.monotonic()) > 0:
+    reached = routed = False
+    with _opened_in_time(keys, connect, mode, tls, until_s) as session:
+        while session is not None and (left_s := until_s - time.monotonic()) > 0:
             for reply in session.get(key, payload=request.to_json(), timeout=left_s):
                 if reply.ok is not None:
                     return request.reply_from_json(reply.ok.payload.to_bytes())
             reached = reached or bool(session.info.transports())
+            routed = mode == "peer" and bool(session.info.routers_zid())
             time.sleep(min(ASK_AGAIN_S, left_s))
-    where = " or ".join(connect)
     if not reached:
-        raise PublishError(f"nobody answers at {where} within {timeout_s:g} s: is the daemon running, and there?")
+        raise PublishError(_why_no_link(connect, (), tls, timeout_s))
+    where = " or ".join(connect)
+    if routed:
+        raise PublishError(_router_and_peers(where))
+    rights = "" if tls is None else f" {_ours(tls)}, and {common_name(rig, Role.OPERATOR)!r} alone may command it."
     raise PublishError(
-        f"{where} answers, but nobody on {key} within {timeout_s:g} s: check the rig's name and the key prefix; do the "
-        "access rules let this certificate ask? A replay takes no requests. What was asked may have been done all the "
-        "same: the same request, repeated, is answered with its outcome"
+        f"{where} answers, but nobody on {key} within {timeout_s:g} s: check the rig's name and the key prefix."
+        f"{rights} A replay takes no requests. What was asked may have been done all the same: the same request, "
+        "repeated, is answered with its outcome"
     )
+
+
+def control_configured(
+    rig: str, request: ControlRequest, settings: "SubscribingConfig", *, timeout_s: float = 10.0
+) -> ControlReply:
+    """`control`, as the `[subscribing]` table of a configuration has it."""
+    return control(
+        rig,
+        request,
+        settings.connect,
+        key_prefix=settings.key_prefix,
+        mode=settings.mode,
+        tls=TlsFiles.configured(settings.tls),
+        timeout_s=timeout_s,
+    )
+
+
+@contextmanager
+def _opened_in_time(
+    keys: RigKeys, connect: Sequence[str], mode: Mode, tls: TlsFiles | None, until_s: float
+) -> Iterator[zenoh.Session | None]:
+    """A session; None where nobody answered a client in time."""
+    with ExitStack() as opened:
+        session = None
+        while session is None and time.monotonic() < until_s:
+            try:
+                session = opened.enter_context(open_session(connect=connect, mode=mode, tls=tls, rigs=[keys]))
+            except NobodyAnswers:
+                time.sleep(min(CLIENT_TRIES_EVERY_S, max(until_s - time.monotonic(), 0)))
+        yield session
+
+
+def _why_no_link(connect: Sequence[str], listen: Sequence[str], tls: TlsFiles | None, timeout_s: float) -> str:
+    if tls is not None:
+        whys = (f"{endpoint}: {why}" for endpoint in connect if (why := tls.why_refused(endpoint)))
+        if why := "; ".join(whys):
+            return f"no link within {timeout_s:g} s: {why}"
+    return (
+        f"nobody answers at {' or '.join((*connect, *listen))} within {timeout_s:g} s: is the daemon running, does it "
+        "listen on this endpoint (publishing.listen in its configuration), does a firewall stand between?"
+    )
+
+
+def _router_and_peers(where: str) -> str:
+    return (
+        f"a router answers at {where}, and routers pass nothing on between two peers: be a client of it "
+        '(subscribing.mode = "client" in the configuration, or --client)'
+    )
+
+
+def _ours(tls: TlsFiles) -> str:
+    return f"{tls.certificate} is {name_of(tls.check())!r}"
 
 
 def _pairs_dropped(message: TrackMessage) -> int:

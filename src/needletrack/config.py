@@ -11,7 +11,7 @@ import re
 import tomllib
 from functools import cached_property
 from pathlib import Path
-from typing import Annotated, Any, Self
+from typing import Annotated, Any, Literal, Self
 
 from annotated_types import Ge, Gt, Le
 from pydantic import (
@@ -178,6 +178,40 @@ class DaemonConfig(BaseModel):
     )
 
 
+class TlsConfig(BaseModel):
+    """The files of a mutually authenticated TLS link: all three, or none."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    authority: OptionalPath = Field(
+        None, description="Certificate of the authority whom both sides trust, PEM; empty: no TLS."
+    )
+    certificate: OptionalPath = Field(None, description="Our own certificate, PEM.")
+    key: OptionalPath = Field(None, description="Its private key, PEM, for its owner alone to read (chmod 600).")
+
+    @model_validator(mode="after")
+    def _all_or_none(self) -> Self:
+        missing = [name for name in ("authority", "certificate", "key") if getattr(self, name) is None]
+        if len(missing) in (1, 2):
+            raise ValueError(f"{' and '.join(missing)} is missing: authority, certificate and key go together")
+        return self
+
+
+class OverlayConfig(BaseModel):
+    """Pictures for people, kept away from the tracks: a session and endpoints of their own."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    rate_hz: Annotated[float, Ge(0), Le(30), AllowInfNan(False)] = Field(
+        0.0, description="Pictures a second, at most: both views with the curve in them; 0: none."
+    )
+    jpeg_quality: Annotated[int, Ge(10), Le(100)] = Field(80, description="Quality of the JPEG, 10 to 100.")
+    listen: tuple[Endpoint, ...] = Field(
+        ("tcp/127.0.0.1:7448",), description="Zenoh endpoints to listen on, other than those of the tracks."
+    )
+    connect: tuple[Endpoint, ...] = Field((), description="Zenoh endpoints to connect to.")
+
+
 class PublishingConfig(BaseModel):
     """Where the tracks go."""
 
@@ -194,6 +228,23 @@ class PublishingConfig(BaseModel):
     heartbeat_s: Annotated[Positive, Le(60)] = Field(
         0.5, description="Interval of the status messages, seconds, at most 60."
     )
+    tls: TlsConfig = Field(TlsConfig(), description="Who may connect; with it, every endpoint is tls/HOST:PORT.")
+    overlay: OverlayConfig = Field(OverlayConfig(), description="Pictures for people.")
+
+
+class SubscribingConfig(BaseModel):
+    """Where `needletrack watch`, `needletrack control` and the Python client find the daemon."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    mode: Literal["peer", "client"] = Field(
+        "peer", description="peer: of the daemon itself; client: of a router, or of the daemon."
+    )
+    connect: tuple[Endpoint, ...] = Field(
+        ("tcp/127.0.0.1:7447",), description="Zenoh endpoints of the daemon or the router, protocol/address."
+    )
+    key_prefix: KeyPrefix = Field("needletrack", description="As the daemon's publishing.key_prefix.")
+    tls: TlsConfig = Field(TlsConfig(), description="Our part of the link's TLS.")
 
 
 class Config(BaseModel):
@@ -208,6 +259,7 @@ class Config(BaseModel):
     drift: DriftParameters = Field(DriftParameters(), description="When a camera counts as moved.")
     pairing: PairingConfig = Field(PairingConfig(), description="Which frames belong together.")
     publishing: PublishingConfig = Field(PublishingConfig(), description="Where the tracks go.")
+    subscribing: SubscribingConfig = Field(SubscribingConfig(), description="Where a subscriber finds the daemon.")
     cameras: CamerasSettings = Field(CamerasSettings(), description="The two cameras.")
     recording: RecordingConfig = Field(RecordingConfig(), description="Where recordings go.")
     daemon: DaemonConfig = Field(DaemonConfig(), description="How the daemon lives on its machine.")
@@ -228,11 +280,17 @@ class Config(BaseModel):
     @cached_property
     def digest(self) -> str:
         """Twelve hexadecimal digits (SHA-256) of every value that can change a track, but for the rig's path."""
-        # The rig has a digest of its own; where a recording goes, how the process is scheduled, and what it could be
-        # asked change no track.
-        values = self.model_dump(
-            mode="json", exclude={"rig": {"path"}, "recording": True, "daemon": True, "control": True}
-        )
+        # The rig has a digest of its own; where a recording goes, how the process is scheduled, what it could be asked,
+        # who may read and who does change no track.
+        excluded: dict[str, Any] = {
+            "rig": {"path"},
+            "recording": True,
+            "daemon": True,
+            "control": True,
+            "subscribing": True,
+            "publishing": {"tls", "overlay"},
+        }
+        values = self.model_dump(mode="json", exclude=excluded)
         content = json.dumps(values, sort_keys=True)
         return hashlib.sha256(content.encode()).hexdigest()[:12]
 
@@ -329,17 +387,32 @@ def _merged(values: dict[str, Any], overrides: dict[str, Any]) -> dict[str, Any]
     return merged
 
 
-_PATHS = (("rig", "path"), ("recording", "folder"), ("control", "token_file"), ("control", "snapshot_folder"))
+_TLS_FILES = ("authority", "certificate", "key")
+_PATHS = (
+    ("rig", "path"),
+    ("recording", "folder"),
+    ("control", "token_file"),
+    ("control", "snapshot_folder"),
+    *(("publishing", "tls", name) for name in _TLS_FILES),
+    *(("subscribing", "tls", name) for name in _TLS_FILES),
+)
 
 
 def _anchored(values: dict[str, Any], folder: Path) -> dict[str, Any]:
     """The same values with their paths made absolute."""
-    anchored = dict(values)
-    for table, key in _PATHS:
-        entries = anchored.get(table)
-        if isinstance(entries, dict) and isinstance(entries.get(key), str) and entries[key]:
-            anchored[table] = {**entries, key: folder / Path(entries[key]).expanduser()}
-    return anchored
+    for path in _PATHS:
+        values = _anchored_at(values, path, folder)
+    return values
+
+
+def _anchored_at(values: dict[str, Any], path: tuple[str, ...], folder: Path) -> dict[str, Any]:
+    head, *rest = path
+    below = values.get(head)
+    if rest and isinstance(below, dict):
+        return {**values, head: _anchored_at(below, tuple(rest), folder)}
+    if not rest and isinstance(below, str) and below:
+        return {**values, head: folder / Path(below).expanduser()}
+    return values
 
 
 def _origin(entry: tuple[str | int, ...], variables: dict[str, tuple[str, ...]], path: Path | None) -> str:

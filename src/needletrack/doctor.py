@@ -21,9 +21,10 @@ from needletrack.capture.live import SIDES, LiveSource
 from needletrack.capture.pairing import Trigger
 from needletrack.config import Config
 from needletrack.daemon.process import AlreadyRunning, OnlyInstance, may_lock_memory, may_schedule
-from needletrack.daemon.run import require_fit
+from needletrack.daemon.run import listened_on, require_fit
 from needletrack.errors import NeedletrackError
-from needletrack.publish.session import open_session
+from needletrack.publish.session import open_endpoints, open_session
+from needletrack.publish.tls import TlsFiles
 from needletrack.records import Clock, Image, StereoPair
 from needletrack.rig import Rig
 
@@ -286,10 +287,17 @@ def _endpoints(config: Config, *, listening: bool) -> Iterator[Finding]:
     listen = config.publishing.listen
     if not listening:
         try:
-            open_session(listen).close()  # type: ignore[no-untyped-call]
+            open_session(listen, tls=TlsFiles.configured(config.publishing.tls)).close()  # type: ignore[no-untyped-call]
             yield Finding("zenoh", Verdict.PASS, f"can listen on {', '.join(listen)}")
         except NeedletrackError as error:
             yield Finding("zenoh", Verdict.FAIL, str(error), "see publishing.listen")
+    for endpoint in open_endpoints(listened_on(config)):
+        yield Finding(
+            "security",
+            Verdict.WARN,
+            f"{endpoint}: anybody on the network may read, publish on our keys, and answer in our place",
+            "listen on loopback, or set publishing.tls (docs/security.md)",
+        )
     for endpoint in config.publishing.connect:
         yield _reached(endpoint)
 

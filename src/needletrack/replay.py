@@ -13,6 +13,7 @@ from needletrack.auditing import AuditedTracker
 from needletrack.config import Config
 from needletrack.publish.message import RunContext, Source, TrackMessage
 from needletrack.publish.publisher import ZenohPublisher
+from needletrack.publish.tls import TlsFiles
 from needletrack.recording.asl import UnusablePair
 from needletrack.recording.replay import ReplaySource, StoredRecording
 from needletrack.recording.stored import open_stored
@@ -85,6 +86,7 @@ class Replay:
             connect=self.config.publishing.connect,
             key_prefix=self.config.publishing.key_prefix,
             heartbeat_s=self.config.publishing.heartbeat_s,
+            tls=TlsFiles.configured(self.config.publishing.tls),
         )
 
     def run(

@@ -18,7 +18,8 @@ from rich.text import Text
 
 from needletrack.client import Freshness, Health, Received, StatusMessage, Subscriber
 from needletrack.publish.keys import DEFAULT_PREFIX
-from needletrack.publish.session import DEFAULT_ENDPOINT
+from needletrack.publish.session import DEFAULT_ENDPOINT, Mode
+from needletrack.publish.tls import TlsFiles
 from needletrack.records import Status
 
 DRAW_PERIOD_S = 0.1
@@ -85,6 +86,8 @@ def watch(
     connect: Sequence[str] = (DEFAULT_ENDPOINT,),
     *,
     key_prefix: str = DEFAULT_PREFIX,
+    mode: Mode = "peer",
+    tls: TlsFiles | None = None,
     until_gone: bool = False,
     count: int | None = None,
     wait_s: float | None = None,
@@ -94,12 +97,13 @@ def watch(
 ) -> WatchSummary:
     """Show a rig's tracks until Ctrl-C, `stop`, `count` tracks, or (until_gone) until the daemon has gone.
 
-    On a terminal a panel, drawn ten times a second; elsewhere a line a second. Raises PublishError where
-    the daemon is not there within wait_s (None: wait for ever). max_age_s: an older track is shown as stale.
+    mode, tls: as of `Subscriber`. On a terminal a panel, drawn ten times a second; elsewhere a line a second. Raises
+    PublishError where the daemon is not there within wait_s (None: wait for ever). max_age_s: an older track is shown
+    as stale.
     """
     console = console or Console()
     stop = stop or threading.Event()
-    with Subscriber(rig, connect, key_prefix=key_prefix, max_age_s=max_age_s) as subscriber:
+    with Subscriber(rig, connect, key_prefix=key_prefix, mode=mode, tls=tls, max_age_s=max_age_s) as subscriber:
         if wait_s is not None:
             subscriber.wait_for_daemon(wait_s)
         tally = _Tally(subscriber, where=" ".join(connect))

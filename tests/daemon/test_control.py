@@ -9,7 +9,9 @@ from typing import Any, TypeVar
 import pytest
 from tests.capture.fake_kernel import RunningKernel, two_cameras
 from tests.daemon.test_run import STEER, WAIT_S, Running, config_for, noise, running
+from tests.publish.network import eventually
 from tests.recording.small_recording import SIZE_PX, small_rig
+from tests.test_auditing import second_processes
 from typer.testing import CliRunner
 
 from needletrack.cli import app
@@ -190,9 +192,12 @@ def test_the_needle_changes_between_two_pairs_and_the_messages_say_which(tmp_pat
         found = daemon.until(lambda received: received.message.sequence > (back.after_sequence or 0)).message
         assert found.config_digest == config.digest == back.config_digest
         assert found.centerline_mm is not None
+        # Those of the other needles ended.
+        assert len(second_processes()) == 1
         delivered = kernel.delivered
         daemon.until(lambda received: received.message.sequence > delivered)
         daemon.stop()
+    assert second_processes() == set()
     # One file for each needle, and none of them holds another's track.
     files = sorted(tmp_path.glob("*.mcap"), key=lambda file: int(file.stem.rsplit("-", 1)[1]))
     for file, needle in zip(files, ("default", "trocar", "default"), strict=True):
@@ -201,6 +206,21 @@ def test_the_needle_changes_between_two_pairs_and_the_messages_say_which(tmp_pat
         digests = {TrackMessage.from_json(told).config_digest for _, told in recording.tracks()}
         # A pair between two of them may have been recorded before, and tracked after the change.
         assert config.with_needle(needle).digest in digests
+
+
+def test_a_daemon_that_ends_while_the_needle_changes_leaves_nothing_behind() -> None:
+    rig = small_rig()
+    config = controlled(rig, control={"needles": [THIN]})
+    with running(rig, config, RunningKernel(two_cameras(SIZE_PX), noise)) as daemon, ThreadPoolExecutor(1) as pool:
+        daemon.next()
+        assert len(second_processes()) == 1
+        asking = pool.submit(control, rig.name, NeedleRequest(needle="22g"), config.publishing.listen, timeout_s=3.0)
+        assert eventually(lambda: len(second_processes()) == 2)
+        daemon.stop()
+        assert second_processes() == set()
+        # Whether the answer still found its way is not said; that it was done would be a lie.
+        if asking.exception(WAIT_S) is None:
+            assert asking.result().code == "stopping"
 
 
 def test_to_detect_anew_costs_the_memory_of_one_pair() -> None:

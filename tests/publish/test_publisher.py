@@ -1,8 +1,13 @@
 import queue
+import signal
 import socket
+import subprocess
+import sys
 import threading
+import time
 from collections.abc import Iterator
 
+import psutil
 import pytest
 import zenoh
 
@@ -54,6 +59,45 @@ def test_a_subscriber_gets_what_was_published(endpoint: str) -> None:
     assert str(sample.encoding) == "application/json;needletrack.track.v1"
     assert sample.priority == zenoh.Priority.REAL_TIME
     assert sample.congestion_control == zenoh.CongestionControl.DROP
+
+
+STANDING_BY = """
+import sys, json, zenoh
+config = zenoh.Config()
+for key, value in (("mode", "peer"), ("connect/endpoints", sys.argv[1:]), ("scouting/multicast/enabled", False)):
+    config.insert_json5(key, json.dumps(value))
+session = zenoh.open(config)
+session.declare_subscriber("needletrack/lab/track", print)
+sys.stdin.read()
+"""
+
+
+def test_a_stopped_subscriber_delays_neither_the_others_nor_the_end(endpoint: str) -> None:
+    """Zenoh itself would wait for it for 10 s on closing, and then raise."""
+    message = example_messages()[0]
+    samples: queue.SimpleQueue[zenoh.Sample] = queue.SimpleQueue()
+    with (
+        ZenohPublisher(example_run(), steady, listen=[endpoint]) as publisher,
+        subprocess.Popen([sys.executable, "-c", STANDING_BY, endpoint], stdin=subprocess.PIPE) as process,
+    ):
+        try:
+            assert publisher.wait_for_subscriber(WAIT_S)
+            process.send_signal(signal.SIGSTOP)
+            while psutil.Process(process.pid).status() != psutil.STATUS_STOPPED:
+                time.sleep(0.01)
+            with open_session(connect=[endpoint]) as session:
+                session.declare_subscriber(TRACK, samples.put)
+                # Far more than its link holds; the other gets them all the while, the last among them.
+                for sequence in range(2000):
+                    publisher.publish(message.model_copy(update={"sequence": sequence}))
+                sequence = -1
+                while sequence < 1900:
+                    sequence = TrackMessage.from_json(samples.get(timeout=WAIT_S).payload.to_bytes()).sequence
+            began_s = time.monotonic()
+            publisher.close()
+            assert time.monotonic() - began_s < 5.0
+        finally:
+            process.kill()
 
 
 def test_publishing_without_a_subscriber_is_no_error(endpoint: str) -> None:

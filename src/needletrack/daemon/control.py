@@ -63,7 +63,7 @@ class Operator:
     """Carries requests out: each method takes one and returns what its answer says; raises ControlRefused.
 
     One thread calls it; nothing here waits for tracking, or lets tracking wait. tracker_of: the tracker of a
-    configuration; about: what a recording of it says of itself.
+    configuration, ready to be called in place of the one before; about: what a recording of it says of itself.
     """
 
     def __init__(
@@ -73,7 +73,7 @@ class Operator:
         service: Service,
         recorder: Recorder | None,
         *,
-        tracker_of: Callable[[Rig, Config], Tracker],
+        tracker_of: Callable[[Config], Tracker],
         about: Callable[[Config], About],
     ) -> None:
         self._rig, self._config, self._service, self._recorder = rig, config, service, recorder
@@ -154,7 +154,7 @@ class Operator:
             raise ControlRefused(ControlCode.UNKNOWN_NEEDLE, str(error)) from error
         if request.needle == self.needle:
             return {"changed": False, "needle": self.needle, "config_digest": config.digest}
-        after = self._service.use(self._tracker_of(self._rig, config), config.digest)
+        after = self._service.use(self._tracker_of(config), config.digest)
         self.needle, self._in_use = request.needle, config
         if self._recorder is not None:
             try:

@@ -19,14 +19,18 @@ from needletrack.capture.source import FrameSource
 from needletrack.config import Config
 from needletrack.daemon.control import Operator, authority
 from needletrack.daemon.metrics import Metrics
+from needletrack.daemon.overlay import Overlays
 from needletrack.daemon.process import AlreadyRunning, OnlyInstance, lock_memory, schedule_thread, settle_memory
 from needletrack.daemon.record import both_cameras
 from needletrack.daemon.systemd import Notifier
 from needletrack.errors import CaptureError, ConfigError
-from needletrack.publish.control import ControlDesk
+from needletrack.publish.control import ControlCode, ControlDesk, ControlRefused
 from needletrack.publish.keys import RigKeys
 from needletrack.publish.message import RunContext, Source, TrackMessage, WireCamera, WireRecording, WireSkew
+from needletrack.publish.overlay import OverlayPublisher
 from needletrack.publish.publisher import ZenohPublisher
+from needletrack.publish.session import open_endpoints
+from needletrack.publish.tls import TlsFiles
 from needletrack.recording.mcap_file import About
 from needletrack.recording.recorder import Recorder, RecorderSettings
 from needletrack.records import DropReason, Frame, NeedleTrack, StereoPair
@@ -40,6 +44,8 @@ _STUCK_AFTER_S = 5.0
 # A stop is done within a second: the pair in hand, the publisher, and this.
 _RECORDER_ENDS_WITHIN_S = 0.4
 _STATUS_EVERY_S = 1.0
+# A needle changed is tracked from then on even where its second process is not there yet.
+_AUDITOR_WITHIN_S, _LOOK_EVERY_S = 3.0, 0.05
 
 
 class ExitCode(IntEnum):
@@ -95,6 +101,7 @@ class Daemon:
         self._recorder: Recorder | None = None
         self._operator: Operator | None = None
         self._desk: ControlDesk | None = None
+        self._overlays: Overlays | None = None
         self.service: Service | None = None
 
     def run(self, stop: threading.Event, *, ready: Callable[[], None] = lambda: None) -> DaemonSummary:
@@ -118,7 +125,9 @@ class Daemon:
                 )
                 opened.callback(self._recorder.close, _RECORDER_ENDS_WITHIN_S)
                 source = RecordedSource(source, self._recorder)
-            tracker = opened.enter_context(AuditedTracker(rig, config.tracking))
+            trackers = _Trackers(rig)
+            opened.callback(trackers.close)
+            tracker = trackers.of(config)
             service = self.service = Service(
                 source,
                 tracker,
@@ -131,11 +140,18 @@ class Daemon:
                 in_threads=self._in_thread,
             )
             operator = self._operator = Operator(
-                rig, config, service, self._recorder, tracker_of=tracker_of, about=self._about
+                rig, config, service, self._recorder, tracker_of=trackers.ready, about=self._about
             )
             keys = RigKeys(rig.name, config.publishing.key_prefix)
             desk = self._desk = ControlDesk(self.context, keys, operator.handlers, may_control)
             publisher = opened.enter_context(self._publisher(service, desk))
+            if config.publishing.overlay.rate_hz > 0:
+                self._overlays = opened.enter_context(self._overlays_of(publisher))
+            for endpoint in open_endpoints(listened_on(config)):
+                may = "read and publish"
+                if config.control.enabled and config.control.token_file is None:
+                    may = "read, publish and command"
+                _log.warning("anybody on the network may %s at %s: set publishing.tls", may, endpoint)
             metrics = opened.enter_context(Metrics(service, self.surroundings, config.daemon.metrics_port))
             if config.daemon.lock_memory:
                 lock_memory()
@@ -151,6 +167,8 @@ class Daemon:
             sinks: list[Sink] = [_Published(publisher), metrics, operator.newest]
             if self._recorder is not None:
                 sinks.append(self._recorder)
+            if self._overlays is not None:
+                sinks.append(self._overlays)
             run = service.run(sinks, stop)
             notifier.stopping()
         recorder = self._recorder
@@ -178,6 +196,8 @@ class Daemon:
                 error=state.error,
             )
             last_error = state.error or last_error
+        if self._overlays is not None:
+            last_error = last_error or self._overlays.last_error
         skew = WireSkew.model_validate(asdict(self._cameras.skew))
         needle = None if self._operator is None else self._operator.needle
         counters = {} if self._desk is None else {f"control_{name}": n for name, n in self._desk.counts.items()}
@@ -193,7 +213,13 @@ class Daemon:
             key_prefix=settings.key_prefix,
             heartbeat_s=settings.heartbeat_s,
             control=desk.receive,
+            tls=TlsFiles.configured(settings.tls),
         )
+
+    def _overlays_of(self, publisher: ZenohPublisher) -> Overlays:
+        settings, tls = self.config.publishing.overlay, TlsFiles.configured(self.config.publishing.tls)
+        pictures = OverlayPublisher(publisher.keys, listen=settings.listen, connect=settings.connect, tls=tls)
+        return Overlays(pictures, self.rig, settings.rate_hz, settings.jpeg_quality)
 
     def _about(self, config: Config) -> About:
         return About(self.rig, self.rig.name, self.context.run_id, config.model_dump_json())
@@ -203,6 +229,46 @@ class Daemon:
         # Capture before tracking: a late pair can be tracked, a lost buffer cannot.
         priority = settings.realtime_priority - (name == "tracking" and settings.realtime_priority > 1)
         schedule_thread(name, priority, settings.cpus)
+
+
+class _Trackers:
+    """The tracker in use, and those that come in its place; none outlives `close`."""
+
+    def __init__(self, rig: Rig) -> None:
+        self._rig = rig
+        self._changing, self._closed = threading.Lock(), False
+        self._newest: AuditedTracker | None = None
+
+    def of(self, config: Config) -> AuditedTracker:
+        """A configuration's tracker, its second process started, in place of the one before.
+
+        That process ends with the thread that calls this.
+        """
+        with self._changing:
+            self._refuse_at_the_end()
+            self._newest = AuditedTracker(self._rig, config.tracking, after=self._newest).__enter__()
+            return self._newest
+
+    def ready(self, config: Config) -> AuditedTracker:
+        """The same, once its second process is there: until then a needle that is lost is not looked for."""
+        tracker, until_s = self.of(config), time.monotonic() + _AUDITOR_WITHIN_S
+        while time.monotonic() < until_s:
+            with self._changing:
+                self._refuse_at_the_end()
+                if tracker.warm_up(_LOOK_EVERY_S):
+                    break
+        return tracker
+
+    def close(self) -> None:
+        """End the second processes of all of them; to be called when nobody tracks any more."""
+        with self._changing:
+            self._closed = True
+            if self._newest is not None:
+                self._newest.close()
+
+    def _refuse_at_the_end(self) -> None:
+        if self._closed:
+            raise ControlRefused(ControlCode.STOPPING, "the daemon is about to end")
 
 
 class _Published:
@@ -266,6 +332,12 @@ def exit_code(error: Exception) -> ExitCode:
     if isinstance(error, AlreadyRunning):
         return ExitCode.ALREADY_RUNNING
     return ExitCode.CAMERAS if isinstance(error, CaptureError) else ExitCode.UNUSABLE
+
+
+def listened_on(config: Config) -> tuple[str, ...]:
+    """All endpoints at which the daemon listens, as configured."""
+    settings = config.publishing
+    return (*settings.listen, *(settings.overlay.listen if settings.overlay.rate_hz > 0 else ()))
 
 
 def _recorder_settings(config: Config) -> RecorderSettings:

@@ -14,17 +14,23 @@ from needletrack.errors import PublishError
 from needletrack.publish.clock import CLOCK_ENCODING, ClockMessage
 from needletrack.publish.keys import DEFAULT_PREFIX, STATUS_ENCODING, TRACK_ENCODING, RigKeys
 from needletrack.publish.message import RunContext, StatusMessage, TrackMessage
-from needletrack.publish.session import DEFAULT_ENDPOINT, direct, open_session
+from needletrack.publish.session import DEFAULT_ENDPOINT, close_soon, direct, open_session
+from needletrack.publish.tls import TlsFiles
 
 DEFAULT_HEARTBEAT_S = 0.5
+
+# On a link of half the rate that 50 Hz need, poses grew older without end, as long as the kernel buffered for
+# them (5.1 s old after 10 s, and none lost); with this, 1.4 s old at most, and every other one lost and counted.
+SEND_BUFFER_BYTES = 65536
 
 
 class ZenohPublisher:
     """Publishes one rig's tracks; waits for no subscriber, and at most 1 ms for one whose link is full.
 
-    status is called once a heartbeat, from this object's own thread, and once more on closing. Raises
-    PublishError where an endpoint is taken or malformed. An error of `status` is raised by the next
-    `publish` or by `close`. control: takes the queries below `control/`, in Zenoh's thread; None answers none.
+    status is called once a heartbeat, from this object's own thread, and once more on closing. control: takes the
+    queries below `control/`, in Zenoh's thread; None answers none. tls: whoever connects then shows a certificate, and
+    may do what its role may. Raises PublishError where an endpoint is taken or malformed, or a file of tls cannot be
+    used. An error of `status` is raised by the next `publish` or by `close`.
     """
 
     def __init__(
@@ -37,6 +43,7 @@ class ZenohPublisher:
         key_prefix: str = DEFAULT_PREFIX,
         heartbeat_s: float = DEFAULT_HEARTBEAT_S,
         control: Callable[[zenoh.Query], None] | None = None,
+        tls: TlsFiles | None = None,
     ) -> None:
         self.keys = RigKeys(run.rig, key_prefix)
         self._status = status
@@ -46,14 +53,16 @@ class ZenohPublisher:
         self._stop = threading.Event()
         self._failure: Exception | None = None
         with ExitStack() as opened:
-            session = opened.enter_context(open_session(listen, connect))
+            session = opened.enter_context(
+                open_session(listen, connect, tls=tls, rigs=[self.keys], send_buffer_bytes=SEND_BUFFER_BYTES)
+            )
             self._declare(session)
             if control is not None:
                 session.declare_queryable(self.keys.control("*"), direct(control))
             # Last, and so first to go: whoever sees the token can query, and gets the last heartbeat.
             opened.enter_context(session.liveliness().declare_token(self.keys.alive))
             # A program that ends without `close` closes the session all the same.
-            self._close_session = weakref.finalize(self, opened.pop_all().close)
+            self._close_session = weakref.finalize(self, close_soon, opened.pop_all())
         self._heart = threading.Thread(target=self._beat, name="needletrack-heartbeat", daemon=True)
         self._heart.start()
 

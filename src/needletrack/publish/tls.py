@@ -1,0 +1,179 @@
+"""The three files of a mutually authenticated TLS link, looked at before Zenoh reads them, and why a link was refused.
+
+Zenoh itself only times out where a certificate does not fit.
+"""
+
+import re
+import socket
+import ssl
+import stat
+from collections.abc import Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any, Self
+
+from cryptography import x509
+from cryptography.exceptions import InvalidSignature, UnsupportedAlgorithm
+from cryptography.hazmat.primitives.serialization import load_pem_private_key
+from cryptography.x509.oid import NameOID
+
+from needletrack.config import TlsConfig
+from needletrack.errors import PublishError
+
+_HANDSHAKE_WITHIN_S = 1.0
+# Until then a server that refuses our certificate has said so: in TLS 1.3 the client is done before it is judged.
+_ALERT_WITHIN_S = 0.5
+
+
+@dataclass(frozen=True, slots=True)
+class TlsFiles:
+    """Paths (PEM) of the authority whom both sides trust, and of our own certificate and its private key."""
+
+    authority: Path
+    certificate: Path
+    key: Path
+
+    @classmethod
+    def configured(cls, settings: TlsConfig) -> Self | None:
+        """What a configuration names; None where it names nothing."""
+        if settings.authority is None or settings.certificate is None or settings.key is None:
+            return None
+        return cls(settings.authority, settings.certificate, settings.key)
+
+    def check(self, now: datetime | None = None) -> x509.Certificate:
+        """Our certificate, where these files can be used now; raises PublishError with the file and the remedy."""
+        authorities, (certificate, *between) = _certificates(self.authority), _certificates(self.certificate)
+        _check_private(self.key)
+        try:
+            key = load_pem_private_key(self.key.read_bytes(), password=None)
+        except (ValueError, TypeError, UnsupportedAlgorithm) as error:
+            # Not the parser's own words: nothing of a key belongs into a message.
+            raise PublishError(f"{self.key}: no private key in PEM without a passphrase") from error
+        if key.public_key() != certificate.public_key():
+            raise PublishError(f"{self.key} is not the key of {self.certificate}: take both from one issue")
+        if not _leads_to(certificate, between, authorities):
+            raise PublishError(
+                f"{self.certificate} was not issued by an authority in {self.authority} "
+                f"({' or '.join(one.subject.rfc4514_string() for one in authorities)}), but by "
+                f"{certificate.issuer.rfc4514_string()}: take both from one authority, and put certificates in between "
+                "behind ours, into its file"
+            )
+        now = now or datetime.now(UTC)
+        for path, one in ((self.authority, authorities[0]), (self.certificate, certificate)):
+            if now > one.not_valid_after_utc:
+                raise PublishError(f"{path} expired on {one.not_valid_after_utc:%Y-%m-%d %H:%M} UTC: have it renewed")
+            if now < one.not_valid_before_utc:
+                raise PublishError(
+                    f"{path} is valid from {one.not_valid_before_utc:%Y-%m-%d %H:%M} UTC only: is the clock right?"
+                )
+        return certificate
+
+    def zenoh_settings(self) -> dict[str, Any]:
+        """Zenoh's `transport/link/tls`: both sides show a certificate, names are verified, expiry ends a link."""
+        return {
+            "root_ca_certificate": str(self.authority),
+            "enable_mtls": True,
+            "verify_name_on_connect": True,
+            "close_link_on_expiration": True,
+            **{f"{way}_{what}": str(path) for way in ("listen", "connect") for what, path in self._own().items()},
+        }
+
+    def _own(self) -> dict[str, Path]:
+        return {"certificate": self.certificate, "private_key": self.key}
+
+    def why_refused(self, endpoint: str) -> str:
+        """One sentence on why no link to a `tls/HOST:PORT` comes about, or "" where a handshake shows nothing wrong."""
+        match = re.fullmatch(r"tls/\[?([^\]?#]+?)\]?:(\d+)(?:[?#].*)?", endpoint)
+        if match is None:
+            return ""
+        host, port = match[1], int(match[2])
+        try:
+            context = ssl.create_default_context(cafile=str(self.authority))
+            context.load_cert_chain(self.certificate, self.key)
+            with (
+                socket.create_connection((host, port), _HANDSHAKE_WITHIN_S) as raw,
+                context.wrap_socket(raw, server_hostname=host) as link,
+            ):
+                link.settimeout(_ALERT_WITHIN_S)
+                link.recv(1)
+        except ssl.SSLCertVerificationError as error:
+            return self._of_theirs(host, error)
+        except ssl.SSLError as error:
+            return self._of_ours(error)
+        except TimeoutError:
+            return ""  # the handshake was done, and nobody complained
+        except OSError as error:
+            return f"nothing answers on {host}:{port} ({error.strerror or error})"
+        return "the other side closed the link after the handshake: its own log says why"
+
+    def _of_theirs(self, host: str, error: ssl.SSLCertVerificationError) -> str:
+        said = error.verify_message or str(error)
+        if "mismatch" in said or "not valid for" in said:
+            return (
+                f"its certificate is not for {host!r} ({said}): connect to a name that it holds, or have it issued "
+                "with this one among its subject alternative names"
+            )
+        if "expired" in said or "not yet valid" in said:
+            return f"its certificate is out of date ({said}): renew it there, or set the clock right here"
+        return f"its certificate is not of the authority in {self.authority} ({said})"
+
+    def _of_ours(self, error: ssl.SSLError) -> str:
+        said = (error.reason or "TLS failed").replace("_", " ").lower()
+        if "wrong version" in said or "record layer" in said:
+            return "no TLS is spoken there: is the port right, and does the other side listen on tls/?"
+        return (
+            f"the other side refused {self.certificate} ({said}): is it of the authority that the other side trusts, "
+            "and valid by the other side's clock?"
+        )
+
+
+def name_of(certificate: x509.Certificate) -> str:
+    """The common name, by which access rules know its holder."""
+    names = certificate.subject.get_attributes_for_oid(NameOID.COMMON_NAME)
+    return str(names[0].value) if names else ""
+
+
+def _leads_to(
+    certificate: x509.Certificate, between: Sequence[x509.Certificate], authorities: Sequence[x509.Certificate]
+) -> bool:
+    """Whether signatures lead from the certificate, through those in between, to one of the authorities."""
+    if any(_issued(certificate, authority) for authority in authorities):
+        return True
+    for index, issuer in enumerate(between):
+        rest = [*between[:index], *between[index + 1 :]]
+        if _issued(certificate, issuer) and _leads_to(issuer, rest, authorities):
+            return True
+    return False
+
+
+def _issued(certificate: x509.Certificate, issuer: x509.Certificate) -> bool:
+    try:
+        certificate.verify_directly_issued_by(issuer)
+    except (ValueError, TypeError, InvalidSignature):
+        return False
+    return True
+
+
+def _certificates(path: Path) -> list[x509.Certificate]:
+    try:
+        return x509.load_pem_x509_certificates(path.read_bytes())
+    except OSError as error:
+        raise PublishError(f"{path}: cannot read the certificate: {error.strerror or error}") from error
+    except ValueError as error:
+        raise PublishError(f"{path}: no X.509 certificate in PEM") from error
+
+
+def _check_private(path: Path) -> None:
+    try:
+        mode = path.stat().st_mode
+        if not stat.S_ISREG(mode):
+            raise PublishError(f"{path}: no file")
+        if mode & (stat.S_IRWXG | stat.S_IRWXO):
+            raise PublishError(
+                f"{path} may be used by others than its owner (mode {stat.S_IMODE(mode):04o}): a private key is its "
+                f"owner's alone: chmod 600 {path}; where others may have read it, have a new one issued"
+            )
+        path.read_bytes()
+    except OSError as error:
+        raise PublishError(f"{path}: cannot read the private key: {error.strerror or error}") from error

@@ -11,7 +11,11 @@ from typing import Any
 from hatchling.builders.hooks.plugin.interface import BuildHookInterface
 
 # Sums may be reordered, so that they vectorise; infinities and NaN keep their meaning, for they have one here.
-FLAGS = ["-std=gnu11", "-O3", "-fPIC", "-shared", "-fvisibility=hidden", "-fno-math-errno", "-fno-trapping-math", "-fassociative-math", "-fno-signed-zeros", "-freciprocal-math", "-Wall", "-Wextra", "-Werror=incompatible-pointer-types"]
+FLAGS = (
+    *("-std=gnu11", "-O3", "-fPIC", "-shared", "-fvisibility=hidden", "-Wall", "-Wextra"),
+    *("-fno-math-errno", "-fno-trapping-math", "-fassociative-math", "-fno-signed-zeros", "-freciprocal-math"),
+    "-Werror=incompatible-pointer-types",
+)
 
 
 class KernelBuildHook(BuildHookInterface):  # type: ignore[type-arg]

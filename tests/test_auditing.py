@@ -71,7 +71,7 @@ def test_what_is_followed_is_audited_beside_it() -> None:
     with AuditedTracker(the_rig(), P) as tracker:
         tracker.warm_up()
         pairs = Sequence(tracker)
-        since = []
+        since: list[int] = []
         until_s = time.monotonic() + WAIT_S
         while (len(since) < 3 or since[-1] > since[-2]) and time.monotonic() < until_s:
             track = pairs.see(scene("dark"))

@@ -1,8 +1,9 @@
 """Tracking beside which a second process looks again, without haste.
 
 The needle is followed from pair to pair in the caller's thread, which takes milliseconds. Searches of whole images take
-ten times as long: a process of its own makes them meanwhile, and what it finds is gone on from as soon as it is there.
-So no pair waits for a search but the first.
+ten times as long: a process of its own makes them meanwhile. What it finds is gone on from at the pair whose stamp says
+that it must be done by then, so that a replay, which makes the same searches in line, gives the same tracks. So no pair
+waits for a search but the first; only where one takes longer than usual the next pair waits a little for it.
 """
 
 import copyreg
@@ -22,12 +23,15 @@ import numpy as np
 from needletrack.records import Frame, NeedleTrack, StereoPair
 from needletrack.rig import Rig
 from needletrack.tracking.parameters import TrackingParameters
-from needletrack.tracking.track import PAIRS_PER_AUDIT_OF_WEAK, adopted, audit, follow, search, track_pair
+from needletrack.tracking.track import PAIRS_PER_AUDIT_OF_WEAK, adopted, audit, follow, search
 
 _log = logging.getLogger(__name__)
 
-# With its own time on top, an audit has looked at what is followed within ten pairs of the one before.
+# An audit begins so many pairs after the one before at the soonest, and what it found is gone on from so long after its
+# pair, by the stamps: at 60 pairs a second, ten pairs after a track has slid it is noticed. A search for a needle that
+# is lost is done sooner. What is not done by then is waited for, but not longer than the last.
 _PAIRS_PER_AUDIT = 5
+_AUDITED_AFTER_NS, _FOUND_AFTER_NS, _WAITED_FOR_S = 80_000_000, 45_000_000, 0.04
 # A needle that is lost is looked for where it was for so long, in case something only passed before it.
 _REMEMBERED_NS = 2_000_000_000
 _RESTART_AFTER_S, _STARTS_WITHIN_S, _ENDS_WITHIN_S = 5.0, 30.0, 1.0
@@ -45,6 +49,8 @@ copyreg.pickle(MappingProxyType, lambda proxy: (_read_only, (dict(proxy),)))
 class AuditedTracker:
     """Our method, one pair after another, of a rig; as a context audits and searches run beside it, else in line.
 
+    Either way the tracks are the same, as long as the second process keeps up.
+
     The first pair, and each that has no track before it, is searched here and now. after: the tracker in whose place
     this one comes; the thread that calls both closes it with the first pair given to this one, or `close` does.
     """
@@ -56,6 +62,7 @@ class AuditedTracker:
         self._is_open, self._failed_at_s = False, 0.0
         self._since_audit = 0
         self._good: NeedleTrack | None = None
+        self._asked: tuple[StereoPair, NeedleTrack] | None = None
         self.failures = 0
 
     def __enter__(self) -> Self:
@@ -101,14 +108,11 @@ class AuditedTracker:
     def __call__(self, pair: StereoPair, previous: NeedleTrack | None) -> NeedleTrack:
         """The track of this pair; previous: that of the pair before, None to start without memory."""
         self._close_the_one_before()
-        if not self._is_open:
-            return track_pair(pair, self._rig, self._parameters, previous)
-        found = self._found()
         if previous is None:
-            self._good = None
+            self._good, self._asked, self._since_audit = None, None, 0
             track = search(pair, self._rig, self._parameters)
         else:
-            track = self._followed(pair, previous, found)
+            track = self._followed(pair, previous, self._found(pair.captured_at_ns))
         if track.curve is not None:
             self._good = track
         self._since_audit += 1
@@ -126,35 +130,62 @@ class AuditedTracker:
         again = follow(pair, self._rig, self._parameters, good)
         return again if again.curve is not None else track
 
-    def _found(self) -> NeedleTrack | None:
-        """What the second process found, once."""
+    def _found(self, now_ns: int) -> NeedleTrack | None:
+        """What was found in the pair that was last looked at again, once, when it is time."""
+        if self._asked is None:
+            return None
+        pair, followed = self._asked
+        lasts_ns = _FOUND_AFTER_NS if followed.curve is None else _AUDITED_AFTER_NS
+        # A camera whose stamps leap backwards has begun anew.
+        if 0 <= now_ns - pair.captured_at_ns < lasts_ns:
+            return None
+        if not self._is_open:
+            self._asked = None
+            return looked_again(pair, followed, self._rig, self._parameters)
         if self._auditor is None:
+            self._asked = None
             return None
         try:
-            return self._auditor.found()
+            found = self._auditor.found(_WAITED_FOR_S)
         except (EOFError, OSError):
             self._give_up()
             return None
+        if found is not None:
+            self._asked = None
+        return found
 
     def _look_again(self, pair: StereoPair, track: NeedleTrack) -> None:
         wanted = PAIRS_PER_AUDIT_OF_WEAK if track.reasons else _PAIRS_PER_AUDIT
-        if track.curve is not None and self._since_audit < wanted:
+        if self._asked is not None or (track.curve is not None and self._since_audit < wanted):
             return
+        if self._is_open and not self._is_asked(pair, track):
+            return
+        self._asked, self._since_audit = (pair, track), 0
+
+    def _is_asked(self, pair: StereoPair, track: NeedleTrack) -> bool:
         if self._auditor is None:
             if time.monotonic() - self._failed_at_s < _RESTART_AFTER_S:
-                return
+                return False
             self._auditor = _Auditor(self._rig, self._parameters)
         try:
-            if self._auditor.look(pair, track):
-                self._since_audit = 0
+            return self._auditor.look(pair, track)
         except (EOFError, OSError):
             self._give_up()
+            return False
 
     def _give_up(self) -> None:
         self.failures += 1
+        self._asked = None
         self._failed_at_s = time.monotonic()
         _log.warning("the process that audits tracks has ended; it is started again in %g s", _RESTART_AFTER_S)
         self._end()
+
+
+def looked_again(pair: StereoPair, followed: NeedleTrack, rig: Rig, parameters: TrackingParameters) -> NeedleTrack:
+    """What a search makes of a pair to which a track was followed, or was not."""
+    if followed.curve is None:
+        return search(pair, rig, parameters)
+    return audit(pair, rig, parameters, followed)
 
 
 class _Auditor:
@@ -183,25 +214,29 @@ class _Auditor:
         return self._process.pid
 
     def wait(self, seconds: float) -> bool:
-        """Wait for it to be there, at most so long; whether it is."""
+        """Wait for it to be there and to have nothing to do, at most so long; whether it is."""
         if not self._is_up and self._pipe.poll(seconds):
             self._pipe.recv()
             self._is_up = True
-        return self._is_up
+        if self._is_busy:
+            self.found(seconds)
+        return self._is_up and not self._is_busy
 
     def look(self, pair: StereoPair, track: NeedleTrack) -> bool:
-        """Give it a pair and the track that was followed to it; False where it is still at another one."""
-        self.wait(0.0)
-        if self._is_busy or not self._is_up:
+        """Give it a pair and the track that was followed to it; False where it is still at another one.
+
+        What it made of another one, which nobody asked for any more, is dropped.
+        """
+        if not self.wait(0.0):
             return False
         self._images[0], self._images[1] = pair.left.image, pair.right.image
         self._pipe.send((pair.left.captured_at_ns, pair.right.captured_at_ns, pair.sequence, track))
         self._is_busy = True
         return True
 
-    def found(self) -> NeedleTrack | None:
-        """What it made of the pair that it was given, once it is done."""
-        if not self._is_busy or not self._pipe.poll():
+    def found(self, seconds: float) -> NeedleTrack | None:
+        """What it made of the pair that it was given, waiting at most so long; None where it is not done."""
+        if not self._is_busy or not self._pipe.poll(seconds):
             return None
         self._is_busy = False
         found: NeedleTrack = self._pipe.recv()
@@ -238,7 +273,4 @@ def _audit_pairs(
         except EOFError:
             return
         pair = StereoPair(Frame(images[0].copy(), left_ns), Frame(images[1].copy(), right_ns), sequence)
-        if followed.curve is None:
-            pipe.send(search(pair, rig, parameters))
-        else:
-            pipe.send(audit(pair, rig, parameters, followed))
+        pipe.send(looked_again(pair, followed, rig, parameters))

@@ -141,6 +141,13 @@ def replay(
         ),
     ] = False,
     independent: Independent = False,
+    as_live: Annotated[
+        bool,
+        typer.Option(
+            "--as-live",
+            help="Go on from what a search finds as late as live: the tracks that the daemon published. So does --paced.",
+        ),
+    ] = False,
     start: Start = 0,
     end: End = None,
     loop: Annotated[int, typer.Option(min=1, help="Play so many times, forward and backward in turn.")] = 1,
@@ -170,6 +177,7 @@ def replay(
             method=method,
             paced=paced,
             independent=independent,
+            as_live=as_live,
             start=start,
             end=end,
             loop=loop,

@@ -22,6 +22,7 @@ from needletrack.records import NeedleTrack, StereoPair
 from needletrack.rig import Rig, find_rig, import_camchain, read_rig
 from needletrack.service import RunSummary, Service, Sink, Tracker
 from needletrack.tracking.reference import track_reference
+from needletrack.tracking.track import track_pair
 
 _log = logging.getLogger(__name__)
 
@@ -33,8 +34,9 @@ class Replay:
 
     method: our own, or the 2017 reference. paced: at the recorded pace, pairs are dropped where tracking is
     too slow; otherwise every pair is tracked, and two runs give the same bytes. independent: every pair
-    starts without memory. start, end, loop: as of ReplaySource. Raises CalibrationError where the rig sees
-    nothing of the workspace, RecordingError where there is nothing to play.
+    starts without memory. as_live: what an audit finds in a pair is gone on from as late as live, so that the tracks
+    are those that were published; otherwise at once, which is better. start, end, loop: as of ReplaySource. Raises
+    CalibrationError where the rig sees nothing of the workspace, RecordingError where there is nothing to play.
     """
 
     def __init__(
@@ -45,6 +47,7 @@ class Replay:
         method: Method = "curve",
         paced: bool = False,
         independent: bool = False,
+        as_live: bool = False,
         start: int = 0,
         end: int | None = None,
         loop: int = 1,
@@ -53,7 +56,7 @@ class Replay:
         rig.require_view_of(config.tracking.workspace)
         self.recording, self.config, self.method, self.independent = recording, config, method, independent
         self._start, self._paced = start, paced
-        self._tracker = _tracker(method, rig, config)
+        self._tracker = _tracker(method, rig, config, as_live=paced or as_live)
         self.source = ReplaySource(recording, paced=paced, start=start, end=end, loop=loop)
         if warning := rig.age_warning(config.rig.max_age_days, datetime.now(UTC)):
             _log.warning("%s", warning)
@@ -147,8 +150,13 @@ def _is_camchain(path: Path) -> bool:
     return False
 
 
-def _tracker(method: Method, rig: Rig, config: Config) -> Tracker:
+def _tracker(method: Method, rig: Rig, config: Config, *, as_live: bool) -> Tracker:
     def by_reference(pair: StereoPair, previous: NeedleTrack | None) -> NeedleTrack:
         return track_reference(pair, rig)
 
-    return by_reference if method == "reference" else AuditedTracker(rig, config.tracking)
+    def by_curve(pair: StereoPair, previous: NeedleTrack | None) -> NeedleTrack:
+        return track_pair(pair, rig, config.tracking, previous)
+
+    if method == "reference":
+        return by_reference
+    return AuditedTracker(rig, config.tracking) if as_live else by_curve

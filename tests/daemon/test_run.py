@@ -205,8 +205,8 @@ def without_times(message: bytes) -> dict[str, Any]:
 
 
 def registered_before_a_camera_was_turned(rig: Rig) -> Rig:
-    """The rig as it was before the right camera was pitched by 0.1 degrees, registered to a robot."""
-    turned = Motion(turn_deg=np.array([-0.1, 0.0, 0.0])).applied_to(rig)
+    """The rig as it was before the right camera was pitched by 0.07 degrees, registered to a robot."""
+    turned = Motion(turn_deg=np.array([-0.07, 0.0, 0.0])).applied_to(rig)
     before = replace(rig, right_from_left=turned.right_from_left)
     seen_mm = np.array([[-40.0, -30, 220], [45, -25, 230], [-35, 35, 240], [40, 30, 225], [0, 0, 290]])
     robot_from_rig = RigidTransform(
@@ -230,10 +230,12 @@ def test_an_old_calibration_is_said_at_the_start_and_in_every_heartbeat(caplog: 
         assert status.calibration.warning == (said[0].getMessage() if is_old else None)
 
 
-def live_and_replayed(folder: Path, rig: Rig, count: int) -> list[TrackMessage]:
+def live_and_replayed(folder: Path, rig: Rig, count: int, monkeypatch: pytest.MonkeyPatch) -> list[TrackMessage]:
     """So many pairs of steer-b tracked live, one after another; asserts that their replay gives the same bytes."""
     recorded, cameras = AslRecording(STEER), two_cameras(rig.left.size_px)
     daemons: list[Daemon] = []
+    # However busy this machine is: what is not found in time is found later, and that is not the same.
+    monkeypatch.setattr("needletrack.auditing._WAITED_FOR_S", WAIT_S)
 
     def one_at_a_time(number: int) -> tuple[bytes, bytes] | None:
         # A pair comes when the one before it is done, so that none is overwritten.
@@ -256,15 +258,17 @@ def live_and_replayed(folder: Path, rig: Rig, count: int) -> list[TrackMessage]:
     published = [told for _, told in McapRecording(file).tracks()]
     assert published == [message.to_json() for message in live]
     output = folder / "replayed.jsonl"
-    Replay(open_recording(file, config), config).run(threading.Event(), output=output)
+    Replay(open_recording(file, config), config, as_live=True).run(threading.Event(), output=output)
     replayed = output.read_bytes().splitlines()
     for ours, again in zip(published, replayed, strict=True):
         assert json.dumps(without_times(ours)).encode() == json.dumps(without_times(again)).encode()
     return live
 
 
-def test_recorded_live_and_replayed_give_the_same_bytes_in_the_robot_s_frame(tmp_path: Path) -> None:
-    live = live_and_replayed(tmp_path, registered_before_a_camera_was_turned(AslRecording(STEER).rig), 2)
+def test_recorded_live_and_replayed_give_the_same_bytes_in_the_robot_s_frame(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    live = live_and_replayed(tmp_path, registered_before_a_camera_was_turned(AslRecording(STEER).rig), 2, monkeypatch)
     assert any(message.centerline_mm for message in live)
     assert {message.frame_id for message in live} == {"robot_base"}
     in_robot_mm = np.array([message.tip.position_mm for message in live if message.tip is not None])
@@ -275,8 +279,8 @@ def test_recorded_live_and_replayed_give_the_same_bytes_in_the_robot_s_frame(tmp
 
 
 @pytest.mark.slow
-def test_a_turned_camera_is_told_live_as_soon_as_is_configured(tmp_path: Path) -> None:
-    live = live_and_replayed(tmp_path, registered_before_a_camera_was_turned(AslRecording(STEER).rig), 9)
+def test_a_turned_camera_is_told_live_as_soon_as_is_configured(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    live = live_and_replayed(tmp_path, registered_before_a_camera_was_turned(AslRecording(STEER).rig), 15, monkeypatch)
     assert not any("calibration_drift" in message.reasons for message in live[:4])
     assert (live[-1].status, "calibration_drift" in live[-1].reasons) == (Status.DEGRADED, True)
 

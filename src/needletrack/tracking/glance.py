@@ -71,6 +71,8 @@ Images = tuple[Image, Image]
 
 # Between two pairs the tip is not expected to come further than this; the curve is kept so far beyond, mm.
 MOST_ADVANCE_MM, _BEYOND_MM = 3.0, 3.0
+# Where it is not there, it is looked for once more, about so much further on.
+_FARTHER_MM, _FARTHEST_ADVANCE_MM = 5.0, 8.0
 # Nor is it off from where its motion would take it by more than a few of these, a second.
 ADVANCE_SIGMA_MM_S = 18.0
 # The tip is looked for this far beyond where the needle was followed to, in so many rounds.
@@ -87,9 +89,9 @@ _MOST_CONTROL = 30
 # The tip shows its angle to the line of sight over so many points.
 _TIP_POINTS = 8
 # What the kernel says; 0: found.
-_FOUND, _CLIPPED = 0, 7
+_FOUND, _BEYOND, _CLIPPED = 0, 1, 7
 _LOST = {
-    1: Reason.JUMP,
+    _BEYOND: Reason.JUMP,
     2: Reason.LOW_COVERAGE,
     3: Reason.HIGH_UNCERTAINTY,
     4: Reason.TOO_SHORT,
@@ -166,9 +168,13 @@ def glance(images: Images, rig: StereoRig, steady: Steady, parameters: GlancePar
         pictures = inside_pictures(steady.taper_mm, shaft, unit_mm(parameters.needle), sine, None)
         pictures.lay_out(view, 0)
         kept = (*kept, contiguous, pictures.parts, pictures.own, pictures.extent)
-    room = len(points_mm) + round((MOST_ADVANCE_MM + 2 * _BEYOND_MM) / parameters.spacing_mm) + 16
+    room = len(points_mm) + round((_FARTHEST_ADVANCE_MM + 2 * _BEYOND_MM) / parameters.spacing_mm) + 16
     found = _Room(room)
     answer = call("glance", now, eyes, views, found.record)
+    if answer == _BEYOND:
+        # Its tip may have been placed too short before.
+        now.advance_mm, now.most_advance_mm, now.foreseen_sigma_mm = _FARTHER_MM, _FARTHEST_ADVANCE_MM, np.inf
+        answer = call("glance", now, eyes, views, found.record)
     if answer == _CLIPPED:
         return None
     if answer in _LOST:

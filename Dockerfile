@@ -4,6 +4,12 @@
 #       replay /recordings/steer-b --paced --loop 100 --publish tcp/127.0.0.1:7447
 FROM python:3.11-slim-bookworm AS build
 
+# The kernels are compiled here; the image that runs has no compiler.
+# hadolint ignore=DL3008
+RUN apt-get update \
+    && apt-get install --yes --no-install-recommends gcc libc6-dev \
+    && rm -rf /var/lib/apt/lists/*
+
 # The pinned packages change seldom and keep a layer of their own.
 WORKDIR /build
 COPY requirements/build.lock requirements/runtime.lock ./
@@ -11,7 +17,7 @@ RUN pip install --no-cache-dir --no-deps --require-hashes -r build.lock \
     && python -m venv /opt/needletrack \
     && /opt/needletrack/bin/pip install --no-cache-dir --no-deps --require-hashes -r runtime.lock
 
-COPY pyproject.toml README.md LICENSE NOTICE ./
+COPY pyproject.toml hatch_build.py README.md LICENSE NOTICE ./
 COPY src ./src
 RUN python -m hatchling build --target wheel --directory dist \
     && /opt/needletrack/bin/pip install --no-cache-dir --no-deps --no-index dist/*.whl

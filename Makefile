@@ -1,4 +1,5 @@
-# Every target makes what it needs by itself: a bare machine has only Python 3.11+, make and a package index.
+# Every target makes what it needs by itself: a bare machine has only Python 3.11+, make, a C compiler and a package
+# index.
 # Another interpreter: make env PYTHON=python3.12
 
 PYTHON ?= python3
@@ -8,7 +9,7 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check
 PACKAGES := $(VENV)/.packages
 INSTALLED := $(VENV)/.installed
 UV_VERSION := 0.13.9
-CODE = $(wildcard src tests tools benchmarks)
+CODE = $(wildcard src tests tools benchmarks hatch_build.py)
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:

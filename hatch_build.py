@@ -25,7 +25,7 @@ class KernelBuildHook(BuildHookInterface):  # type: ignore[type-arg]
         """Compile; raises SystemExit where there is no compiler."""
         folder = Path(self.root, "src", "needletrack", "kernels")
         sources = sorted(str(path) for path in folder.glob("*.c"))
-        targets = {"kernels.so": []}
+        targets: dict[str, list[str]] = {"kernels.so": []}
         if platform.machine() in ("x86_64", "AMD64"):
             targets["kernels-v3.so"] = ["-march=x86-64-v3"]
         compiler = shlex.split(os.environ.get("CC", "cc"))

@@ -11,15 +11,18 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, Self
+from typing import TYPE_CHECKING, Any, Self
 
 from cryptography import x509
 from cryptography.exceptions import InvalidSignature, UnsupportedAlgorithm
 from cryptography.hazmat.primitives.serialization import load_pem_private_key
 from cryptography.x509.oid import NameOID
 
-from needletrack.config import TlsConfig
 from needletrack.errors import PublishError
+
+if TYPE_CHECKING:
+    # It takes a second to load, which a command line that asks for help does not have.
+    from needletrack.config import TlsConfig
 
 _HANDSHAKE_WITHIN_S = 1.0
 # Until then a server that refuses our certificate has said so: in TLS 1.3 the client is done before it is judged.
@@ -35,7 +38,7 @@ class TlsFiles:
     key: Path
 
     @classmethod
-    def configured(cls, settings: TlsConfig) -> Self | None:
+    def configured(cls, settings: "TlsConfig") -> Self | None:
         """What a configuration names; None where it names nothing."""
         if settings.authority is None or settings.certificate is None or settings.key is None:
             return None

@@ -32,6 +32,7 @@ _log = logging.getLogger(__name__)
 # is lost is done sooner. What is not done by then is waited for, but not longer than the last.
 _PAIRS_PER_AUDIT = 5
 _AUDITED_AFTER_NS, _FOUND_AFTER_NS, _WAITED_FOR_S = 80_000_000, 45_000_000, 0.04
+_PAIRS_BEFORE_WAITING = 2
 # A needle that is lost is looked for where it was for so long, in case something only passed before it.
 _REMEMBERED_NS = 2_000_000_000
 _RESTART_AFTER_S, _STARTS_WITHIN_S, _ENDS_WITHIN_S = 5.0, 30.0, 1.0
@@ -63,6 +64,7 @@ class AuditedTracker:
         self._since_audit = 0
         self._good: NeedleTrack | None = None
         self._asked: tuple[StereoPair, NeedleTrack] | None = None
+        self._has_waited = False
         self.failures = 0
 
     def __enter__(self) -> Self:
@@ -146,10 +148,13 @@ class AuditedTracker:
             self._asked = None
             return None
         try:
-            found = self._auditor.found(_WAITED_FOR_S)
+            # Once, and not where pairs are lost already: a machine that is too busy must not lose more of them to it.
+            may_wait = not self._has_waited and self._since_audit >= _PAIRS_BEFORE_WAITING
+            found = self._auditor.found(_WAITED_FOR_S if may_wait else 0.0)
         except (EOFError, OSError):
             self._give_up()
             return None
+        self._has_waited = found is None
         if found is not None:
             self._asked = None
         return found
@@ -160,7 +165,7 @@ class AuditedTracker:
             return
         if self._is_open and not self._is_asked(pair, track):
             return
-        self._asked, self._since_audit = (pair, track), 0
+        self._asked, self._since_audit, self._has_waited = (pair, track), 0, False
 
     def _is_asked(self, pair: StereoPair, track: NeedleTrack) -> bool:
         if self._auditor is None:

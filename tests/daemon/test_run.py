@@ -236,6 +236,7 @@ def live_and_replayed(folder: Path, rig: Rig, count: int, monkeypatch: pytest.Mo
     daemons: list[Daemon] = []
     # However busy this machine is: what is not found in time is found later, and that is not the same.
     monkeypatch.setattr("needletrack.auditing._WAITED_FOR_S", WAIT_S)
+    monkeypatch.setattr("needletrack.auditing._PAIRS_BEFORE_WAITING", 0)
 
     def one_at_a_time(number: int) -> tuple[bytes, bytes] | None:
         # A pair comes when the one before it is done, so that none is overwritten.

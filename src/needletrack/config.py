@@ -9,6 +9,7 @@ import json
 import os
 import re
 import tomllib
+from contextlib import suppress
 from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any
@@ -28,6 +29,7 @@ from pydantic_settings import BaseSettings, EnvSettingsSource, SettingsConfigDic
 from needletrack.calibration.drift import DriftParameters
 from needletrack.capture.settings import CamerasSettings
 from needletrack.errors import ConfigError
+from needletrack.reading import text_of
 from needletrack.tracking.parameters import TrackingParameters
 from needletrack.validation import complaints, known_keys, nearest_key
 
@@ -187,10 +189,12 @@ class _Environment(BaseSettings, Config):
 
 def _read_toml(path: Path) -> dict[str, Any]:
     try:
-        return tomllib.loads(path.read_text(encoding="utf-8"))
+        return tomllib.loads(text_of(path))
     except OSError as error:
         raise ConfigError(f"{path}: cannot read the configuration: {error.strerror or error}") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+    except RecursionError as error:
+        raise ConfigError(f"{path}: not a configuration: it nests too deep") from error
+    except ValueError as error:  # also for a number of thousands of digits
         raise ConfigError(f"{path}: not a TOML file: {error}") from error
 
 
@@ -242,7 +246,10 @@ def _anchored(values: dict[str, Any], folder: Path) -> dict[str, Any]:
     for table, key in _PATHS:
         entries = values.get(table)
         if isinstance(entries, dict) and isinstance(entries.get(key), str) and entries[key]:
-            anchored[table] = {**entries, key: folder / Path(entries[key]).expanduser()}
+            path = Path(entries[key])
+            with suppress(RuntimeError):  # ~ of a user who is not there: the name stays, and is not found
+                path = path.expanduser()
+            anchored[table] = {**entries, key: folder / path}
     return anchored
 
 

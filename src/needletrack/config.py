@@ -34,6 +34,8 @@ from needletrack.tracking.parameters import TrackingParameters
 from needletrack.validation import complaints, known_keys, nearest_key
 
 ENVIRONMENT_PREFIX = "NEEDLETRACK_"
+# The longest has 20 kB; tomllib's time for a name of so many parts grows with their square.
+_MOST_BYTES = 100_000
 
 Positive = Annotated[float, Gt(0), AllowInfNan(False)]
 
@@ -189,7 +191,7 @@ class _Environment(BaseSettings, Config):
 
 def _read_toml(path: Path) -> dict[str, Any]:
     try:
-        return tomllib.loads(text_of(path))
+        return tomllib.loads(text_of(path, _MOST_BYTES))
     except OSError as error:
         raise ConfigError(f"{path}: cannot read the configuration: {error.strerror or error}") from error
     except RecursionError as error:

@@ -21,12 +21,12 @@ import yaml
 from PIL import Image as PictureFile
 from PIL import UnidentifiedImageError
 
-# A rig with its uncertainty takes 10 kB, a configuration 20.
-MOST_DOCUMENT_BYTES = 1_000_000
+# A rig with its uncertainty takes 10 kB; PyYAML takes a second for 100.
+MOST_DOCUMENT_BYTES = 300_000
 # 67 million: more than the cameras have that can be had, and 64 MB as gray.
 MOST_PIXELS = 1 << 26
 
-# PyYAML takes a second for 100 kB; aliases multiply what the constructor makes of it.
+# Aliases multiply what the constructor makes of it.
 _MOST_NODES, _DEEPEST = 100_000, 64
 _PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 _PICTURE_FORMATS = ("PNG", "JPEG", "BMP", "TIFF", "PPM")
@@ -88,7 +88,6 @@ def text_of(path: Path | str, most_bytes: int = MOST_DOCUMENT_BYTES, encoding: s
 
 def yaml_document(text: str, loader: type[yaml.SafeLoader] = yaml.SafeLoader) -> Any:
     """What a YAML text holds; ValueError where it is none, nests too deep, or multiplies itself by aliases."""
-    reader = None
     try:
         reader = loader(text)
         node = reader.get_single_node()
@@ -96,20 +95,21 @@ def yaml_document(text: str, loader: type[yaml.SafeLoader] = yaml.SafeLoader) ->
             return None
         _require_small(node)
         return reader.construct_document(node)
-    except yaml.YAMLError as error:
+    except (yaml.YAMLError, _TooLarge) as error:
         raise ValueError(str(error)) from error
     except RecursionError as error:
         raise ValueError(f"it nests more than {_DEEPEST} deep") from error
     except (ValueError, LookupError, TypeError, AttributeError, ArithmeticError) as error:
         # `!!int abc`, 2026-13-45 and their like: PyYAML lets out whatever Python says to them.
         raise ValueError(f"a value that YAML does not know how to read: {error}") from error
-    finally:
-        if reader is not None:
-            reader.dispose()
+
+
+class _TooLarge(ValueError):
+    """A document with more in it than any of ours."""
 
 
 def _require_small(root: yaml.Node) -> None:
-    """ValueError where a document, its aliases written out, is no document of ours."""
+    """_TooLarge where a document, its aliases written out, is no document of ours."""
     sizes: dict[int, int] = {}
     inside: set[int] = set()
 
@@ -117,7 +117,7 @@ def _require_small(root: yaml.Node) -> None:
         if id(node) in sizes:
             return sizes[id(node)]
         if depth > _DEEPEST or id(node) in inside:
-            raise ValueError(f"it nests more than {_DEEPEST} deep, or contains itself")
+            raise _TooLarge(f"it nests more than {_DEEPEST} deep, or contains itself")
         inside.add(id(node))
         below = 0
         if isinstance(node, yaml.MappingNode):
@@ -127,7 +127,7 @@ def _require_small(root: yaml.Node) -> None:
         inside.remove(id(node))
         sizes[id(node)] = 1 + below
         if sizes[id(node)] > _MOST_NODES:
-            raise ValueError(f"its aliases make more than {_MOST_NODES} values of it")
+            raise _TooLarge(f"its aliases make more than {_MOST_NODES} values of it")
         return sizes[id(node)]
 
     size(root, 0)

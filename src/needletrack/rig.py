@@ -332,7 +332,10 @@ def write_rig(rig: Rig, path: Path | str) -> None:
 
     Raises CalibrationError where the file cannot be written or cannot hold the lens model.
     """
-    path = Path(path).resolve()
+    try:
+        path = Path(path).resolve()
+    except (OSError, RuntimeError) as error:  # a link to itself
+        raise CalibrationError(f"{path}: cannot write the rig file: {error}") from error
     try:
         text = rig_text(rig)
     except CalibrationError as error:

@@ -22,7 +22,7 @@ from tests.recording.small_recording import SIZE_PX, image_of, small_rig, write_
 from needletrack.capture.pixels import Layout, decoded
 from needletrack.client import StatusMessage, TrackMessage
 from needletrack.config import load_config
-from needletrack.errors import NeedletrackError, PublishError
+from needletrack.errors import NeedletrackError, PublishError, RecordingError
 from needletrack.formats.exchange import export_rig, import_rig
 from needletrack.publish.message import RunContext, ServiceState, Source, WireCalibration
 from needletrack.recording.bag import write_bag
@@ -152,7 +152,7 @@ def _read_recording(path: Path) -> None:
 
 def _read_recording_as_it_is(path: Path) -> None:
     """With the rig that is in it, its tracks, its pictures without a rig, and what can be saved of it."""
-    refused: NeedletrackError | None = None
+    refused: list[str] = []
     saved = path.with_name("saved.mcap")
 
     def tracks() -> None:
@@ -169,11 +169,11 @@ def _read_recording_as_it_is(path: Path) -> None:
         try:
             read()
         except NeedletrackError as error:
-            refused = refused or error
+            refused.append(str(error))
         finally:
             saved.unlink(missing_ok=True)
-    if refused is not None:
-        raise refused
+    if refused:
+        raise RecordingError("; ".join(refused))
 
 
 def _mcap() -> tuple[bytes, ...]:

@@ -37,7 +37,7 @@ def test_the_valid_files_are_taken(edge: Edge) -> None:
 
 @pytest.mark.parametrize("edge", EDGES, ids=lambda edge: edge.name)
 def test_a_damaged_file_is_read_or_refused(edge: Edge) -> None:
-    @settings(PROFILE, max_examples=25)
+    @settings(PROFILE, max_examples=15)
     @given(st.data())
     def run(data: st.DataObject) -> None:
         check(edge, data.draw(damaged(edge)))

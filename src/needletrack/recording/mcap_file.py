@@ -29,7 +29,7 @@ from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.reader import make_reader
-from mcap.records import Attachment, Channel, Chunk, ChunkIndex, Message, MessageIndex, Metadata, Schema
+from mcap.records import Attachment, Channel, Chunk, ChunkIndex, McapRecord, Message, MessageIndex, Metadata, Schema
 from mcap.stream_reader import StreamReader
 from mcap.writer import CompressionType, Writer
 from rosbags.typesys import Stores, get_typestore
@@ -87,7 +87,7 @@ _CUT_OFF = (
     *(OverflowError, MemoryError, RuntimeError, IndexError, TypeError, AttributeError),
 )
 # Of a chunk, once decompressed: a writer ends it after the picture that fills it.
-_MOST_CHUNK_BYTES = 1 << 29
+_MOST_CHUNK_BYTES = 1 << 28
 _GREATEST_STAMP = 2**63 - 1
 
 
@@ -412,7 +412,7 @@ def recover(damaged: Path, output: Path) -> Recovered:
         copy = _Copy(_fast_writer(file))
         whole_until = 0
         try:
-            for record in StreamReader(source, emit_chunks=True, validate_crcs=True).records:
+            for record in _Records(source, emit_chunks=True, validate_crcs=True).records:
                 copy.add(record)
                 whole_until = source.tell()
         except _CUT_OFF:
@@ -424,6 +424,18 @@ def recover(damaged: Path, output: Path) -> Recovered:
         raise RecordingError(f"{damaged}: nothing in it could be read: no MCAP file, or cut off before its first pair")
     pairs = min(copy.counts.get(LEFT_TOPIC, 0), copy.counts.get(RIGHT_TOPIC, 0))
     return Recovered(pairs, copy.counts.get(TRACK_TOPIC, 0), lost)
+
+
+class _Records(StreamReader):
+    """Records up to the first that was never written: a file system may leave zeros there after a power cut.
+
+    The library takes nine zeros for a record of no kind and no length, and reads on: an hour for 10 GB.
+    """
+
+    def _read_record(self, opcode: int, length: int) -> McapRecord | None:
+        if opcode == 0:
+            raise McapError("zeros in place of a record")
+        return super()._read_record(opcode, length)
 
 
 class _Copy:
@@ -488,7 +500,7 @@ def _fast_writer(file: IO[bytes]) -> Writer:
 
 
 def unpacked_zstd(data: bytes) -> bytes:
-    """What a zstd frame holds; ValueError where it claims more than half a gigabyte, or is damaged."""
+    """What a zstd frame holds; ValueError where it claims more than a quarter of a gigabyte, or is damaged."""
     size = zstandard.frame_content_size(data)
     if size > _MOST_CHUNK_BYTES:
         raise ValueError(f"a part claims to hold {size / 1e9:.1f} GB")
@@ -499,7 +511,7 @@ def unpacked_zstd(data: bytes) -> bytes:
 
 
 def unpacked_by(decompressor: Any, data: bytes) -> bytes:
-    """What a bz2 or lz4 decompressor, or zstandard's, makes of data; ValueError where that is above half a gigabyte."""
+    """What a decompressor of bz2, lz4 or zstandard makes of data; ValueError above a quarter of a gigabyte."""
     if isinstance(decompressor, zstandard.ZstdDecompressor):
         with decompressor.stream_reader(data) as reader:
             content, whole = reader.read(_MOST_CHUNK_BYTES), not reader.read(1)

@@ -19,6 +19,7 @@ RIG = ("rig_x_mm", "rig_y_mm", "rig_z_mm")
 ROBOT = ("robot_x_mm", "robot_y_mm", "robot_z_mm")
 QUATERNION = ("robot_qx", "robot_qy", "robot_qz", "robot_qw")
 _UNIT = 1e-2
+_MOST_BYTES = 50_000_000
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,7 +37,7 @@ class PointPairs:
 def read_pairs(path: Path) -> PointPairs:
     """The pairs of a CSV file with a head; raises CalibrationError that names the line."""
     try:
-        with StringIO(text_of(path, encoding="utf-8-sig"), newline="") as file:
+        with StringIO(text_of(path, _MOST_BYTES, "utf-8-sig"), newline="") as file:
             reader = csv.DictReader(file, skipinitialspace=True)
             head = [name.strip() for name in reader.fieldnames or ()]
             reader.fieldnames = head

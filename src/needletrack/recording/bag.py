@@ -11,7 +11,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import cv2
-import lz4.frame  # type: ignore[import-untyped]
+import lz4.frame
 import numpy as np
 import rosbags.rosbag1.reader
 import rosbags.rosbag2.reader

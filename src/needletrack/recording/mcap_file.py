@@ -21,7 +21,7 @@ from threading import Lock
 from types import SimpleNamespace
 from typing import IO, Any, cast
 
-import lz4.frame  # type: ignore[import-untyped]
+import lz4.frame
 import mcap.writer
 import numpy as np
 import zstandard

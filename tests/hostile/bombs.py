@@ -192,7 +192,7 @@ BOMBS: dict[str, tuple[str, Callable[[], bytes]]] = {
     "camchain that laughs": ("kalibr", lambda: _yaml_laughs("cam0")),
     "camchain whose model laughs": (
         "kalibr",
-        lambda: _yaml_laughs("x").replace(b"x: *a11", b"cam0: {camera_model: *a11}\ncam1: {}"),
+        lambda: b"cam0:\n  " + _yaml_laughs("camera_model").strip().replace(b"\n", b"\n  ") + b"\ncam1: {}\n",
     ),
     "camera_info that laughs": ("ros", lambda: _yaml_laughs("camera_matrix") + b"projection_matrix: 1\n"),
     "camera model of brackets": ("mrcal", lambda: b"(" * _DEEP),

@@ -79,7 +79,7 @@ def cut_and_flipped(number: int) -> bytes:
 
 def _is_message(payload: bytes) -> bool:
     with suppress(Exception):
-        return TrackMessage.from_json(payload).rig == RIG
+        return str(TrackMessage.from_json(payload).rig) == RIG
     return False
 
 

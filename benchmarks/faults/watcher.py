@@ -1,4 +1,4 @@
-"""The independent subscriber: python -m benchmarks.faults.watcher MODE RIG ENDPOINT... writes JSON lines of what it sees.
+"""The independent subscriber: python -m benchmarks.faults.watcher MODE RIG ENDPOINT... writes what it sees.
 
 Times are CLOCK_MONOTONIC, which all processes of a machine share.
 """

@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.faults.stage import Child, Link, Missed, Stage, Watcher, ended, fresh, said_last, until
+from benchmarks.loopback import free_endpoint
 from needletrack.capture.v4l2_abi import Request
 from needletrack.client import Subscriber
 from needletrack.daemon.run import ExitCode
@@ -160,15 +161,16 @@ def flagged_buffers(stage: Stage) -> Seen:
     return Seen(saw, watcher.fresh_after(time.monotonic()), _counted(watcher, before))
 
 
-@fault("cameras", "QBUF fails", "VIDIOC_QBUF of the left camera refused 3 times with EIO")
+@fault("cameras", "QBUF fails", "VIDIOC_QBUF of the left camera refused 3 times with EINVAL")
 def qbuf(stage: Stage) -> Seen:
     """A buffer is not taken back."""
     daemon, watcher = stage.running()
     before, at_s = watcher.drops(), time.monotonic()
-    daemon.say("refuse", 0, Request.QBUF.value, errno.EIO, 3)
-    beat = watcher.heartbeat(at_s, lambda b: b["cameras"]["left"]["queue_errors"] >= 3, "3 queue errors")
+    daemon.say("refuse", 0, Request.QBUF.value, errno.EINVAL, 3)
+    beat = watcher.heartbeat(at_s, lambda b: b["cameras"]["left"]["queue_errors"] > 0, "a queue error")
     watcher.tracks(beat["at_s"], 30)
-    return Seen(f"queue_errors 3 in the status; {_changes(watcher, at_s)}", 0.0, _counted(watcher, before))
+    errors = watcher.since(at_s, "heartbeat")[-1]["heartbeat"]["cameras"]["left"]["queue_errors"]
+    return Seen(f"queue_errors {errors} in the status; {_changes(watcher, at_s)}", 0.0, _counted(watcher, before))
 
 
 @fault("cameras", "STREAMON fails", "unplugged; VIDIOC_STREAMON refused 3 times with EIO after the return")
@@ -234,7 +236,7 @@ def swapped(stage: Stage) -> Seen:
     healthy_s = watcher.fresh_after(on_s)
     node = watcher.heartbeat(on_s, lambda b: b["cameras"]["left"]["state"] == "streaming", "streaming")
     where = node["heartbeat"]["cameras"]["left"]["node"]
-    _require(_share_ok(watcher, on_s) > 0, "no track was ok: left and right are exchanged")
+    until(lambda: _any_ok(watcher, on_s), "an ok track: left and right are exchanged")
     return Seen(f"{saw}; the left camera now at {where}", healthy_s, f"the pairs of {_silence(watcher, at_s):.1f} s")
 
 
@@ -428,14 +430,21 @@ def other_killed(stage: Stage) -> Seen:
     return Seen(f"the first: {_changes(watcher, at_s)}", 0.0, _lost(watcher, at_s))
 
 
-@fault("network", "nonsense on our keys", "100 random payloads and one of 64 MB, put by another peer")
+@fault(
+    "network",
+    "nonsense on our keys",
+    "100 random payloads and one of 64 MB, put by a neighbour",
+)
 def nonsense(stage: Stage) -> Seen:
     """Who may put at all is decided by certificates; what is put is checked."""
-    _, watcher = stage.running()
-    at_s = time.monotonic()
+    rogue = free_endpoint()
+    stage.daemon()
     random = np.random.default_rng(7)
-    with open_session(connect=[stage.endpoint]) as session:
-        time.sleep(0.5)
+    with open_session(listen=[rogue]) as session:
+        # The daemon passes on nothing that another peer puts: it must be a neighbour of the subscriber itself.
+        watcher = stage.watcher(stage.endpoint, rogue)
+        fresh(watcher)
+        at_s = time.monotonic()
         for number in range(100):
             session.put(f"needletrack/{stage.rig}/track", random.bytes(number * 10))
         session.put(f"needletrack/{stage.rig}/track", bytes(2 * MOST_RECEIVED_BYTES))
@@ -457,9 +466,8 @@ def _changes(watcher: Watcher, since_s: float) -> str:
     return ", ".join(states) or "no change of health"
 
 
-def _share_ok(watcher: Watcher, since_s: float) -> float:
-    tracks = watcher.since(since_s, "track")
-    return sum(1 for seen in tracks if seen["status"] == "ok") / max(len(tracks), 1)
+def _any_ok(watcher: Watcher, since_s: float) -> bool:
+    return any(seen["status"] == "ok" for seen in watcher.since(since_s, "track"))
 
 
 def _p99_ms(watcher: Watcher, from_s: float, to_s: float) -> float:

@@ -11,6 +11,8 @@ from typing import Any
 from needletrack.client import Freshness, StatusMessage, Subscriber
 
 _LOOK_EVERY_S = 0.004
+# At ten pairs a second a track is a tenth of a second old before the next one is there.
+_MAX_AGE_S = 0.5
 
 
 def main() -> int:
@@ -20,7 +22,7 @@ def main() -> int:
     state: Freshness | None = None
     status: StatusMessage | None = None
     undecodable = 0
-    with Subscriber(rig, endpoints, capacity=1024, **options) as subscriber:
+    with Subscriber(rig, endpoints, capacity=1024, max_age_s=_MAX_AGE_S, **options) as subscriber:
         while True:
             received = subscriber.next(_LOOK_EVERY_S)
             if received is not None:

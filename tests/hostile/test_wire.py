@@ -4,7 +4,6 @@ import json
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import suppress
 from io import StringIO
 
 import pytest
@@ -14,6 +13,7 @@ from tests.daemon.test_run import free_port
 from tests.hostile.edges import BY_NAME
 
 from needletrack.client import Subscriber
+from needletrack.errors import PublishError
 from needletrack.publish.message import MOST_MESSAGE_BYTES, StatusMessage, TrackMessage
 from needletrack.publish.session import MOST_RECEIVED_BYTES, open_session
 from needletrack.watch import watch
@@ -78,9 +78,10 @@ def cut_and_flipped(number: int) -> bytes:
 
 
 def _is_message(payload: bytes) -> bool:
-    with suppress(Exception):
-        return str(TrackMessage.from_json(payload).rig) == RIG
-    return False
+    try:
+        return TrackMessage.from_json(payload).rig == str(RIG)
+    except PublishError:
+        return False
 
 
 def put_until_received(session: zenoh.Session, subscriber: Subscriber, payload: bytes) -> None:

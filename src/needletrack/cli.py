@@ -145,7 +145,8 @@ def replay(
         bool,
         typer.Option(
             "--as-live",
-            help="Go on from what a search finds as late as live: the tracks that the daemon published. So does --paced.",
+            help="Go on from what a search finds as late as live: the tracks that the daemon published. "
+            "So does --paced.",
         ),
     ] = False,
     start: Start = 0,

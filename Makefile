@@ -13,7 +13,7 @@ CODE = $(wildcard src tests tools benchmarks hatch_build.py)
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help env demo test test-slow test-hardware lint format types bench bench-smoke soak fanout accuracy accuracy-page peers table1 schema lock clean
+.PHONY: help env demo test test-slow test-hardware lint format types bench bench-smoke soak fanout fuzz faults accuracy accuracy-page peers table1 schema lock clean
 
 help:  ## list the targets
 	@awk -F ':.*## ' '/^[a-z0-9-]+:.*## / { printf "  make %-12s %s\n", $$1, $$2 }' Makefile
@@ -76,6 +76,12 @@ soak: $(INSTALLED)  ## ten minutes of the live loop at 60 pairs/s with a recorde
 
 fanout: $(INSTALLED)  ## what other subscribers do to a pose, on loopback and across namespaces (make fanout ARGS="--rounds 1")
 	@$(BIN)/python -m benchmarks.fanout $(ARGS)
+
+fuzz: $(INSTALLED)  ## damaged files at every parser, led by coverage, a minute each (make fuzz ARGS="--seconds 600 rig mcap")
+	@$(BIN)/python -m tests.hostile.fuzz $(ARGS)
+
+faults: $(INSTALLED)  ## inject every fault that can be, watch from another process (make faults ARGS="--update docs/reliability.md")
+	@$(BIN)/python -m benchmarks.faults $(ARGS)
 
 accuracy: $(INSTALLED)  ## errors against exact truth, beside other methods (make accuracy ARGS="--peers RECORDING ...")
 	@$(BIN)/python -m benchmarks.accuracy $(ARGS)

@@ -19,6 +19,7 @@ FLOORS: dict[str, float] = {
     "tracking": 2.0,
     "calibration": 2.0,
     "synthetic": 2.0,
+    "reading": 2.5,
     "validation": 3.0,
     "rig": 3.1,
     "formats": 3.15,

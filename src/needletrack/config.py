@@ -9,6 +9,7 @@ import json
 import os
 import re
 import tomllib
+from contextlib import suppress
 from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
@@ -30,11 +31,14 @@ from pydantic_settings import BaseSettings, EnvSettingsSource, SettingsConfigDic
 from needletrack.calibration.drift import DriftParameters
 from needletrack.capture.settings import CamerasSettings
 from needletrack.errors import ConfigError
+from needletrack.reading import text_of
 from needletrack.tracking.needle import Needle
 from needletrack.tracking.parameters import TrackingParameters
 from needletrack.validation import complaints, known_keys, nearest_key
 
 ENVIRONMENT_PREFIX = "NEEDLETRACK_"
+# The longest has 20 kB; tomllib's time for a name of so many parts grows with their square.
+_MOST_BYTES = 100_000
 
 Positive = Annotated[float, Gt(0), AllowInfNan(False)]
 NotNegative = Annotated[float, Ge(0), AllowInfNan(False)]
@@ -341,10 +345,12 @@ class _Environment(BaseSettings, Config):
 
 def _read_toml(path: Path) -> dict[str, Any]:
     try:
-        return tomllib.loads(path.read_text(encoding="utf-8"))
+        return tomllib.loads(text_of(path, _MOST_BYTES))
     except OSError as error:
         raise ConfigError(f"{path}: cannot read the configuration: {error.strerror or error}") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+    except RecursionError as error:
+        raise ConfigError(f"{path}: not a configuration: it nests too deep") from error
+    except ValueError as error:  # also for a number of thousands of digits
         raise ConfigError(f"{path}: not a TOML file: {error}") from error
 
 
@@ -411,7 +417,10 @@ def _anchored_at(values: dict[str, Any], path: tuple[str, ...], folder: Path) ->
     if rest and isinstance(below, dict):
         return {**values, head: _anchored_at(below, tuple(rest), folder)}
     if not rest and isinstance(below, str) and below:
-        return {**values, head: folder / Path(below).expanduser()}
+        anchored = Path(below)
+        with suppress(RuntimeError):  # ~ of a user who is not there: the name stays, and is not found
+            anchored = anchored.expanduser()
+        return {**values, head: folder / anchored}
     return values
 
 

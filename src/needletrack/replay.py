@@ -14,6 +14,7 @@ from needletrack.config import Config
 from needletrack.publish.message import RunContext, Source, TrackMessage
 from needletrack.publish.publisher import ZenohPublisher
 from needletrack.publish.tls import TlsFiles
+from needletrack.reading import text_of
 from needletrack.recording.asl import UnusablePair
 from needletrack.recording.replay import ReplaySource, StoredRecording
 from needletrack.recording.stored import open_stored
@@ -146,7 +147,7 @@ def rig_at(path: Path) -> Rig:
 def _is_camchain(path: Path) -> bool:
     # What cannot be read is no camchain: reading it as a rig file then says why.
     with suppress(OSError, UnicodeDecodeError):
-        return re.search(r"(?m)^cam0\s*:", path.read_text(encoding="utf-8")) is not None
+        return re.search(r"(?m)^cam0\s*:", text_of(path)) is not None
     return False
 
 

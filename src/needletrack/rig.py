@@ -35,6 +35,7 @@ from needletrack.geometry.camera import Camera
 from needletrack.geometry.stereo import StereoRig
 from needletrack.geometry.transform import RigidTransform, orthonormalized
 from needletrack.geometry.uncertainty import RigUncertainty, rigid_motions
+from needletrack.reading import MOST_PIXELS, text_of, yaml_document
 from needletrack.records import Float
 from needletrack.tracking.needle import Workspace
 from needletrack.validation import complaints
@@ -331,7 +332,10 @@ def write_rig(rig: Rig, path: Path | str) -> None:
 
     Raises CalibrationError where the file cannot be written or cannot hold the lens model.
     """
-    path = Path(path).resolve()
+    try:
+        path = Path(path).resolve()
+    except (OSError, RuntimeError) as error:  # a link to itself
+        raise CalibrationError(f"{path}: cannot write the rig file: {error}") from error
     try:
         text = rig_text(rig)
     except CalibrationError as error:
@@ -559,21 +563,23 @@ def _refuse_other_models(path: Path, key: str, entry: object) -> None:
 
 
 def _read_yaml(path: Path) -> Any:
-    return _parsed_yaml(path, lambda: path.read_text(encoding="utf-8"))
+    return _parsed_yaml(path, lambda: text_of(path))
 
 
 def _parsed_yaml(path: Path, text: Callable[[], str]) -> Any:
     try:
-        return yaml.safe_load(text())
+        return yaml_document(text())
     except OSError as error:
         raise CalibrationError(f"{path}: cannot read the calibration: {error.strerror or error}") from error
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
+    except ValueError as error:
         raise CalibrationError(f"{path}: not a YAML file: {error}") from error
 
 
 def _built(path: Path, model: type[BaseModel], build: Callable[[], Rig]) -> Rig:
     try:
-        return build()
+        # What overflows on the way is no number of a rig, which the checks say better than NumPy's warnings.
+        with np.errstate(all="ignore"):
+            return build()
     except ValidationError as error:
         found = "; ".join(complaint.message for complaint in complaints(error, model))
         raise CalibrationError(f"{path}: {found}") from error
@@ -586,7 +592,7 @@ def _rotation(values: npt.ArrayLike, key: str) -> Float:
     matrix = np.asarray(values, dtype=np.float64)
     error = np.abs(matrix @ matrix.T - np.eye(3)).max()
     determinant = np.linalg.det(matrix)
-    if error > _NEAR_ROTATION or determinant < 0:
+    if not error <= _NEAR_ROTATION or determinant < 0:
         raise ValueError(
             f"{key} is not a rotation (R R^T is off from the identity by {error:.1e}, its determinant is "
             f"{determinant:.4f}): a digit, a sign or the order is wrong, or it has fewer than five decimals"
@@ -596,6 +602,8 @@ def _rotation(values: npt.ArrayLike, key: str) -> Float:
 
 
 def _check_camera(side: str, camera: Camera) -> None:
+    if camera.size_px[0] * camera.size_px[1] > MOST_PIXELS:
+        raise ValueError(f"{side} camera: images of {_size(camera)} are larger than {MOST_PIXELS >> 20} million pixels")
     size, focal, center = np.array(camera.size_px), np.diag(camera.matrix)[:2], camera.matrix[:2, 2]
     if (focal < 0.1 * size).any() or (focal > 200 * size).any() or not 0.5 < focal[0] / focal[1] < 2:
         raise ValueError(

@@ -4,7 +4,6 @@ Of the tracks called ok, none may be false: no needle there; tip or shape (95th 
 millimetre; less than 0.8 of what both cameras see covered; base and tip exchanged. Every distance is in space.
 """
 
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -15,6 +14,7 @@ import numpy.typing as npt
 
 from needletrack.errors import RecordingError
 from needletrack.geometry.spline import arc_length, distance_from_curve, resample
+from needletrack.reading import json_document, text_of
 from needletrack.records import Float, NeedleTrack, Status
 from needletrack.synthetic.world import Truth
 
@@ -22,6 +22,7 @@ GREATEST_ERROR_MM = 1.0
 LEAST_COVER = 0.8
 # A curve of kilometres is wrong, not large.
 STEP_MM, MOST_POINTS = 0.5, 4000
+_MOST_BYTES = 1 << 29
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,13 +59,11 @@ def recorded_truth(folder: Path) -> dict[int, TrueShape]:
     """The truth of a recording by the left camera's stamp, ns; raises RecordingError where there is none to read."""
     path = folder / "truth.json"
     try:
-        return {
-            int(frame["t_ns"]): _true_shape(frame) for frame in json.loads(path.read_text(encoding="utf-8"))["frames"]
-        }
+        return {int(frame["t_ns"]): _true_shape(frame) for frame in json_document(text_of(path, _MOST_BYTES))["frames"]}
     except OSError as error:
         raise RecordingError(f"{path}: cannot read the truth: {error.strerror or error}") from error
-    except (ValueError, KeyError, TypeError) as error:
-        raise RecordingError(f"{path}: not the truth about a recording: {error!r}") from error
+    except (ValueError, LookupError, TypeError, OverflowError, AttributeError) as error:
+        raise RecordingError(f"{path}: not the truth about a recording: {type(error).__name__}: {error}") from error
 
 
 def _true_shape(frame: dict[str, Any]) -> TrueShape:

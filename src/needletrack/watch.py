@@ -178,7 +178,7 @@ class _Tally:
         state = health.state.value + (f": {health.reason}" if health.reason else "")
         seconds = (time.monotonic_ns() - self._began_ns) / 1e9
         if self._newest is None:
-            return f"{seconds:7.1f} s  {state}"
+            return _plain(f"{seconds:7.1f} s  {state}")
         parts = (
             f"{seconds:7.1f} s",
             _status(self._newest),
@@ -191,7 +191,7 @@ class _Tally:
             f"clock {self._clock()}",
             state,
         )
-        return "  ".join(parts)
+        return _plain("  ".join(parts))
 
     def panel(self) -> RenderableType:
         """The picture for a terminal."""
@@ -201,7 +201,7 @@ class _Tally:
         rows.add_column()
         if self._newest is not None:
             message = self._newest.message
-            rows.add_row("track", Text(_status(self._newest), style=STATUS_STYLE[message.status]))
+            rows.add_row("track", Text(_plain(_status(self._newest)), style=STATUS_STYLE[message.status]))
             rows.add_row("tip", _tip(self._newest))
             rows.add_row("length", f"{_number(message.length_mm, 2)} mm")
             rows.add_row(
@@ -210,13 +210,13 @@ class _Tally:
                 f"   p99 {_number(self._latency_ms(99), 1)}",
             )
             rows.add_row("rate", f"{_number(self._rate_hz(), 1)} Hz   {self.messages} tracks   {self._shares()}")
-            rows.add_row("missed", self._missed())
+            rows.add_row("missed", Text(_plain(self._missed())))
         age = "" if health.age_ms is None else f"   {health.age_ms:.0f} ms old"
         reason = f"   {health.reason}" if health.reason else ""
-        rows.add_row("link", Text(f"{health.state.value}{age}{reason}", style=HEALTH_STYLE[health.state]))
-        rows.add_row("clock", self._clock())
+        rows.add_row("link", Text(_plain(f"{health.state.value}{age}{reason}"), style=HEALTH_STYLE[health.state]))
+        rows.add_row("clock", Text(_plain(self._clock())))
         if (status := self._subscriber.status) is not None:
-            rows.add_row("daemon", _daemon(status))
+            rows.add_row("daemon", Text(_plain(_daemon(status))))
         return Panel(rows, title=f"needletrack · {self._subscriber.keys.rig}", subtitle=self._where, title_align="left")
 
     def _rate_hz(self) -> float | None:
@@ -257,6 +257,11 @@ def _display(console: Console, tally: _Tally) -> Iterator[tuple[Callable[[], Non
         return
     with Live(tally.panel(), console=console, auto_refresh=False) as live:
         yield lambda: live.update(tally.panel(), refresh=True), DRAW_PERIOD_S
+
+
+def _plain(text: str) -> str:
+    """What came over the wire, as it may stand on a terminal: nothing in it moves the cursor or rings the bell."""
+    return "".join(character if character.isprintable() else "\N{REPLACEMENT CHARACTER}" for character in text)
 
 
 def _status(received: Received) -> str:

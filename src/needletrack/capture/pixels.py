@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from needletrack.reading import picture
 from needletrack.records import Image
 
 _END_OF_JPEG = b"\xff\xd9"
@@ -55,9 +56,7 @@ def _jpeg(data: bytes | memoryview, layout: Layout) -> Image:
     # libjpeg fills what is missing with gray and says nothing.
     if _END_OF_JPEG not in bytes(data[-64:]):
         raise ValueError("the JPEG has no end")
-    picture = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE)
-    if picture is None:
-        raise ValueError("no JPEG")
-    if picture.shape != (layout.height, layout.width):
-        raise ValueError(f"a JPEG of {picture.shape[1]}x{picture.shape[0]}")
-    return np.asarray(picture, np.uint8)
+    pixels = picture(data, cv2.IMREAD_GRAYSCALE, ("JPEG",))
+    if pixels.shape != (layout.height, layout.width):
+        raise ValueError(f"a JPEG of {pixels.shape[1]}x{pixels.shape[0]}")
+    return np.asarray(pixels, np.uint8)

@@ -4,6 +4,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal
 
+import numpy as np
+
 from needletrack.errors import CalibrationError
 from needletrack.formats.geometry import text_of
 from needletrack.formats.kalibr import write_kalibr
@@ -54,15 +56,17 @@ def import_rig(
     if kind in _PAIRS and len(files) != 2:
         raise CalibrationError(f"{files[0]}: {kind} has a file for each camera: name the left and the right one")
     unit = unit_mm or _UNIT_MM.get(kind, 1.0)
-    if kind == "kalibr":
-        return import_camchain(files[0], name)
-    if kind == "ros":
-        return read_ros(files[0], files[1], name, unit)
-    if kind == "mrcal":
-        return read_mrcal(files[0], files[1], name, unit)
-    if kind == "matlab":
-        return read_matlab(files[0], name, size_px)
-    return read_opencv(files, name, size_px, unit)
+    # What overflows on the way is no calibration, which the checks say better than NumPy's warnings.
+    with np.errstate(all="ignore"):
+        if kind == "kalibr":
+            return import_camchain(files[0], name)
+        if kind == "ros":
+            return read_ros(files[0], files[1], name, unit)
+        if kind == "mrcal":
+            return read_mrcal(files[0], files[1], name, unit)
+        if kind == "matlab":
+            return read_matlab(files[0], name, size_px)
+        return read_opencv(files, name, size_px, unit)
 
 
 def export_rig(rig: Rig, kind: Format, output: Path) -> tuple[Path, ...]:

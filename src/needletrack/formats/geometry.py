@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
+from needletrack import reading
 from needletrack.errors import CalibrationError
 from needletrack.geometry.camera import DISTORTION_LENGTHS, Camera
 from needletrack.geometry.transform import RigidTransform, orthonormalized
@@ -33,7 +34,7 @@ def rotation_of(values: npt.ArrayLike, name: str) -> Float:
     """The rotation (3, 3) that was rounded when it was written; ValueError where it is none."""
     matrix = np.asarray(values, dtype=np.float64).reshape(3, 3)
     error = float(np.abs(matrix @ matrix.T - np.eye(3)).max())
-    if error > _NEAR_ROTATION or np.linalg.det(matrix) < 0:
+    if not error <= _NEAR_ROTATION or np.linalg.det(matrix) < 0:
         raise ValueError(f"{name} is not a rotation: R R^T is off from the identity by {error:.1e}")
     return orthonormalized(matrix)
 
@@ -49,9 +50,11 @@ def rig_of(
 def text_of(path: Path) -> str:
     """A file's text; raises CalibrationError."""
     try:
-        return path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise CalibrationError(f"{path}: cannot read the calibration: {error}") from error
+        return reading.text_of(path)
+    except OSError as error:
+        raise CalibrationError(f"{path}: cannot read the calibration: {error.strerror or error}") from error
+    except UnicodeDecodeError as error:
+        raise CalibrationError(f"{path}: cannot read the calibration: no text: {error}") from error
 
 
 def write_text(path: Path, text: str) -> None:

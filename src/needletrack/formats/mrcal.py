@@ -26,7 +26,9 @@ def read_mrcal(left: Path, right: Path, name: str, unit_mm: float = 1000.0) -> R
     try:
         cameras, poses = zip(*(_model(path, unit_mm) for path in files), strict=True)
         return rig_of(cameras[0], cameras[1], poses[1] @ poses[0].inverse(), name, "mrcal", files)
-    except (ValueError, KeyError, TypeError, SyntaxError) as error:
+    except (RecursionError, MemoryError) as error:  # Python's parser says so
+        raise CalibrationError(f"{left}, {right}: not two mrcal camera models: they nest too deep") from error
+    except (ValueError, KeyError, TypeError, SyntaxError, OverflowError) as error:
         raise CalibrationError(f"{left}, {right}: not two mrcal camera models: {error}") from error
 
 
@@ -69,7 +71,9 @@ def _model(path: Path, unit_mm: float) -> tuple[Any, RigidTransform]:
         raise ValueError(f"{path.name}: {lens} has {_LENSES[lens]} terms of distortion, not {len(terms)}")
     width, height = model["imagersize"]
     camera = camera_of([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], terms or [0.0] * 4, (int(width), int(height)))
-    turn, shift = np.array(model["extrinsics"][:3]), np.array(model["extrinsics"][3:])
+    turn, shift = np.array(model["extrinsics"], dtype=np.float64).reshape(2, 3)
+    if not np.isfinite(turn).all():
+        raise ValueError(f"{path.name}: extrinsics are not finite")
     return camera, RigidTransform(Rotation.from_rotvec(turn).as_matrix(), shift * unit_mm)
 
 

@@ -1,14 +1,23 @@
-"""OpenCV FileStorage (YAML, XML, JSON): one file, or intrinsics and extrinsics apart as its own sample writes them."""
+"""OpenCV FileStorage (YAML, XML, JSON): one file, or intrinsics and extrinsics apart as its own sample writes them.
+
+It is written by OpenCV and read by parsers of its three languages: cv2.FileStorage (5.0.0) corrupts memory and ends the
+process on a damaged file.
+"""
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree as ET
 
 import cv2
 import numpy as np
+import yaml
+from scipy.spatial.transform import Rotation
 
 from needletrack.errors import CalibrationError
 from needletrack.formats.geometry import camera_of, rig_of, rotation_of, text_of, write_text
 from needletrack.geometry.transform import RigidTransform
+from needletrack.reading import json_document, yaml_document
 from needletrack.records import Float
 from needletrack.rig import Rig
 
@@ -32,22 +41,18 @@ def read_opencv(files: Sequence[Path], name: str, size_px: tuple[int, int] | Non
     """
     found: dict[str, Float] = {}
     for path in files:
-        # FileStorage aborts on what is no file of its own kind; it wants to be asked kindly.
-        text = text_of(path)
         try:
-            storage = cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
-        except (cv2.error, SystemError) as error:
+            storage = _storage(text_of(path))
+            for key, names in NAMES.items():
+                for each in names:
+                    if (matrix := _matrix(storage.get(each), each)) is not None:
+                        found.setdefault(key, matrix)
+            for key, names in (("width", _WIDTH), ("height", _HEIGHT)):
+                for each in names:
+                    if isinstance(value := storage.get(each), int):
+                        found.setdefault(key, np.array(value))
+        except ValueError as error:
             raise CalibrationError(f"{path}: not an OpenCV FileStorage: {error}") from error
-        for key, names in NAMES.items():
-            for each in names:
-                node = storage.getNode(each)
-                if not node.empty() and node.isMap():
-                    found.setdefault(key, np.asarray(node.mat(), dtype=np.float64))
-        for key, names in (("width", _WIDTH), ("height", _HEIGHT)):
-            for each in names:
-                if (node := storage.getNode(each)).isInt():
-                    found.setdefault(key, np.array(node.real()))
-        storage.release()
     said = ", ".join(map(str, files))
     if missing := [NAMES[key][0] for key in NAMES if key not in found]:
         raise CalibrationError(f"{said}: {', '.join(missing)} missing (names as of OpenCV's stereo_calib sample)")
@@ -56,7 +61,7 @@ def read_opencv(files: Sequence[Path], name: str, size_px: tuple[int, int] | Non
     size = size_px or (int(found["width"]), int(found["height"]))
     try:
         turn = found["rotation"]
-        rotation = cv2.Rodrigues(turn)[0] if turn.size == 3 else turn
+        rotation = Rotation.from_rotvec(turn.ravel()).as_matrix() if turn.size == 3 else turn
         return rig_of(
             camera_of(found["left_matrix"], found["left_lens"], size),
             camera_of(found["right_matrix"], found["right_lens"], size),
@@ -65,8 +70,72 @@ def read_opencv(files: Sequence[Path], name: str, size_px: tuple[int, int] | Non
             "opencv",
             files,
         )
-    except ValueError as error:
+    except (ValueError, OverflowError) as error:
         raise CalibrationError(f"{said}: {error}") from error
+
+
+class _Loader(yaml.SafeLoader):
+    """YAML with OpenCV's one tag."""
+
+
+_Loader.add_constructor(
+    "tag:yaml.org,2002:opencv-matrix", lambda loader, node: loader.construct_mapping(_mapping(node), deep=True)
+)
+
+
+def _mapping(node: yaml.Node) -> yaml.MappingNode:
+    if not isinstance(node, yaml.MappingNode):
+        raise ValueError("an opencv-matrix without rows, cols and data")
+    return node
+
+
+def _storage(text: str) -> dict[str, Any]:
+    """The top of a FileStorage: names and what stands under them; ValueError where it is none."""
+    if text.lstrip().startswith("<"):
+        return _xml_storage(text)
+    if text.lstrip().startswith("{"):
+        document = json_document(text)
+    else:
+        # `%YAML:1.0` is OpenCV's own; YAML's directive has a blank.
+        document = yaml_document(text.partition("\n")[2] if text.startswith("%YAML") else text, _Loader)
+    if not isinstance(document, dict):
+        raise ValueError("it holds no names")
+    return document
+
+
+def _xml_storage(text: str) -> dict[str, Any]:
+    if "<!" in text.replace("<!--", ""):
+        raise ValueError("a document type or an entity, which OpenCV does not write")
+    try:
+        root = ET.fromstring(text)
+    except (ET.ParseError, RecursionError) as error:
+        raise ValueError(str(error)) from error
+    storage: dict[str, Any] = {}
+    for child in root:
+        plain = (child.text or "").strip()
+        if len(child) == 0:
+            storage[child.tag] = int(plain) if plain.isascii() and plain.isdecimal() and len(plain) < 10 else plain
+        else:
+            parts = {part.tag: (part.text or "").strip() for part in child}
+            storage[child.tag] = {**parts, "data": parts.get("data", "").split()}
+    return storage
+
+
+def _matrix(entry: object, name: str) -> Float | None:
+    """The matrix (rows, cols) in an entry; None where it is something else; ValueError where it contradicts itself."""
+    if not isinstance(entry, dict) or not {"rows", "cols", "data"} <= entry.keys():
+        return None
+    data = entry["data"]
+    if not isinstance(data, list):
+        raise ValueError(f"{name}: its data are no list of numbers")
+    try:
+        rows, columns = int(entry["rows"]), int(entry["cols"])
+        values = np.array([float(value) for value in data])
+    except (TypeError, ValueError, OverflowError) as error:
+        raise ValueError(f"{name}: {error}") from error
+    if min(rows, columns) < 1 or len(values) != rows * columns:
+        raise ValueError(f"{name}: {rows} x {columns} is not the size of {len(values)} numbers")
+    return values.reshape(rows, columns)
 
 
 def write_opencv(rig: Rig, path: Path) -> None:

@@ -14,6 +14,7 @@ from needletrack.errors import CalibrationError
 from needletrack.formats.geometry import camera_of, rig_of, rotation_of, text_of, write_text
 from needletrack.geometry.camera import Camera
 from needletrack.geometry.transform import RigidTransform
+from needletrack.reading import yaml_document
 from needletrack.records import Float
 from needletrack.rig import Rig
 
@@ -37,7 +38,7 @@ def read_ros(left: Path, right: Path, name: str, unit_mm: float = 1000.0) -> Rig
         rotation = turns[1].T @ turns[0]
         shift = turns[1].T @ np.array([projections[1][0, 3] / focal, 0.0, 0.0]) * unit_mm
         return rig_of(cameras[0], cameras[1], RigidTransform(rotation, shift), name, "ros", files)
-    except (ValueError, KeyError, TypeError) as error:
+    except (ValueError, KeyError, TypeError, OverflowError, AttributeError) as error:
         raise CalibrationError(f"{left}, {right}: {_said(error)}") from error
 
 
@@ -73,8 +74,8 @@ def write_ros(rig: Rig, folder: Path) -> tuple[Path, Path]:
 
 def _document(path: Path) -> dict[str, Any]:
     try:
-        document = yaml.safe_load(text_of(path))
-    except yaml.YAMLError as error:
+        document = yaml_document(text_of(path))
+    except ValueError as error:
         raise CalibrationError(f"{path}: not a YAML file: {error}") from error
     if not isinstance(document, dict) or "camera_matrix" not in document:
         raise CalibrationError(f"{path}: not a ROS camera_info file: it has no camera_matrix")

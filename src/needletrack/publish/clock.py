@@ -10,21 +10,23 @@ from typing import Literal, Self
 from pydantic import Field, ValidationError
 
 from needletrack.errors import PublishError
-from needletrack.publish.message import WIRE_VERSION, WirePart
+from needletrack.publish.message import WIRE_VERSION, Stamp, WirePart
 
 CLOCK_ENCODING = "application/json;needletrack.clock.v1"
 # Of the last answers the one with the shortest way counts (RFC 5905, section 10, whose filter keeps eight).
 _ANSWERS_KEPT = 8
 # Two quartz clocks drift apart by less than this (RFC 5905's PHI is 15 ppm a clock).
 _DRIFT_PPM = 30.0
+# An answer has a hundred bytes.
+_MOST_BYTES = 10_000
 
 
 class ClockMessage(WirePart):
     """The daemon's answer on `<prefix>/<rig>/clock`: its Unix time as it took the question and as it answered."""
 
     version: Literal[1] = Field(description="as in the track message")
-    received_at_ns: int = Field(description="Unix time (CLOCK_REALTIME of the daemon's host) as the query came in")
-    replied_at_ns: int = Field(description="the same clock, as the answer went out")
+    received_at_ns: Stamp = Field(description="Unix time (CLOCK_REALTIME of the daemon's host) as the query came in")
+    replied_at_ns: Stamp = Field(description="the same clock, as the answer went out")
 
     @classmethod
     def now(cls, received_at_ns: int, replied_at_ns: int) -> Self:
@@ -34,6 +36,8 @@ class ClockMessage(WirePart):
     @classmethod
     def from_json(cls, data: bytes) -> Self:
         """The message in a reply's payload; raises PublishError."""
+        if len(data) > _MOST_BYTES:
+            raise PublishError(f"not a needletrack.clock.v{WIRE_VERSION} message: it has {len(data)} bytes")
         try:
             return cls.model_validate_json(data, strict=True)
         except ValidationError as error:

@@ -23,7 +23,7 @@ from pydantic import ConfigDict, Field, ValidationError
 
 from needletrack.errors import PublishError
 from needletrack.publish.keys import RigKeys
-from needletrack.publish.message import WIRE_VERSION, Count, RunContext, WirePart
+from needletrack.publish.message import MOST_MESSAGE_BYTES, WIRE_VERSION, Count, RunContext, WirePart
 from needletrack.records import Status
 
 _log = logging.getLogger(__name__)
@@ -182,6 +182,8 @@ class ControlRequest(WirePart):
 
     def reply_from_json(self, data: bytes) -> ControlReply:
         """The answer in a reply's payload, of the class that belongs to this request; raises PublishError."""
+        if len(data) > MOST_MESSAGE_BYTES:
+            raise PublishError(f"not a needletrack.control.v{WIRE_VERSION} answer: it has {len(data)} bytes")
         try:
             return self.reply.model_validate_json(data, strict=True)
         except ValidationError as error:

@@ -31,6 +31,8 @@ from needletrack.records import (
 )
 
 WIRE_VERSION = 1
+# A track of 200 points has 30 kB; what is larger is not read.
+MOST_MESSAGE_BYTES = 4_000_000
 
 # Rounding keeps the JSON short; each is finer than what can be measured by a factor of a thousand or more.
 MM_DIGITS = 6
@@ -45,7 +47,10 @@ UNIT_TOLERANCE = 1e-3
 Vector3 = tuple[float, float, float]
 NotNegative = Annotated[float, Field(ge=0)]
 Cameras = Annotated[int, Field(ge=0, le=2)]
-Count = Annotated[int, Field(ge=0)]
+# What other languages' readers can hold; a larger one is no stamp, and no float either.
+_MOST = 2**63 - 1
+Count = Annotated[int, Field(ge=0, le=_MOST)]
+Stamp = Annotated[int, Field(ge=-_MOST - 1, le=_MOST)]
 
 
 class Source(StrEnum):
@@ -202,14 +207,14 @@ class TrackMessage(WirePart):
     sequence: Count = Field(
         description="number of the stereo pair in its run; a gap is a pair dropped or a sample lost"
     )
-    captured_at_ns: int = Field(description="the left camera's stamp, unchanged, on `clock`")
+    captured_at_ns: Stamp = Field(description="the left camera's stamp, unchanged, on `clock`")
     clock: Clock = Field(description="recorded: whatever the recording's clock was")
-    captured_at_unix_ns: int | None = Field(description="the same instant in Unix time; null if unknown")
+    captured_at_unix_ns: Stamp | None = Field(description="the same instant in Unix time; null if unknown")
     exposure_ns: Count | None = Field(description="length of the exposure; null if unknown")
     stamp_at: StampPlace | None = Field(
         description="where in the exposure the stamp was taken, by the driver; null if unknown"
     )
-    published_at_ns: int | None = Field(
+    published_at_ns: Stamp | None = Field(
         description="Unix time (CLOCK_REALTIME of the daemon's host); null in a deterministic replay"
     )
     status: Status = Field(description="only with ok may a controller act on it")
@@ -383,7 +388,7 @@ class StatusMessage(WirePart):
     source: Source = Field(description="cameras, or a recording")
     config_digest: str = Field(description="equal digests mean equal configurations")
     rig_digest: str = Field(description="equal digests mean equal calibrations")
-    published_at_ns: int | None = Field(description="Unix time of the heartbeat; null in a deterministic replay")
+    published_at_ns: Stamp | None = Field(description="Unix time of the heartbeat; null in a deterministic replay")
     state: ServiceState = Field(description="stopping: a clean stop, the token goes next")
     uptime_s: NotNegative | None = Field(description="null in a deterministic replay")
     heartbeat_s: Annotated[float, Field(gt=0)] = Field(
@@ -464,6 +469,8 @@ _STATUS = TypeAdapter(StatusMessage)
 
 
 def _decoded(model: type[_Message], data: bytes | str, name: str) -> _Message:
+    if len(data) > MOST_MESSAGE_BYTES:
+        raise PublishError(f"not a needletrack.{name}.v{WIRE_VERSION} message: it has {len(data)} bytes")
     try:
         # Strict: a number in a string is a broken producer, not a number.
         return model.model_validate_json(data, strict=True)

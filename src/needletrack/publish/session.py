@@ -27,6 +27,8 @@ DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
 # A hung peer is noticed after three quarters of the lease (0.75 s); Zenoh's own default is 10 s.
 LEASE_MS = 1000
 RECONNECT_MS = (100, 1000)
+# A picture of 32 million pixels.
+MOST_RECEIVED_BYTES = 32_000_000
 CLOSE_WITHIN_S = 0.5
 _CLOSING = "needletrack-close"
 
@@ -95,6 +97,9 @@ def open_session(
         # Opening does not wait for an answer (Zenoh would, for half a second, where none comes).
         "open/return_conditions/connect_scouted": False,
         "transport/link/tx/lease": LEASE_MS,
+        # Zenoh's default is a gigabyte, which any peer may then make us hold, and a queue of them; a larger message is
+        # left out and the link goes on.
+        "transport/link/rx/max_message_size": MOST_RECEIVED_BYTES,
         # Measured on 12 kB tracks: nothing gained, 30 us lost; and who is killed leaves its segments behind.
         "transport/shared_memory/enabled": False,
         # A put waits 1 ms at most for a full link (Zenoh's default, on which `publish` relies), but two

@@ -1,20 +1,29 @@
 """ROS bags with two image topics: read as a recording, made one of ours, and written from one."""
 
+import bz2
 import weakref
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from threading import Lock
+from types import SimpleNamespace
 from typing import Any
 
 import cv2
+import lz4.frame
 import numpy as np
-from rosbags.highlevel import AnyReader, AnyReaderError
+import rosbags.rosbag1.reader
+import rosbags.rosbag2.reader
+import rosbags.rosbag2.storage_mcap
+from rosbags.highlevel import AnyReader
 from rosbags.interfaces import Connection
 from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as BagWriter
+from rosbags.typesys import Stores, get_typestore
 
-from needletrack.errors import CalibrationError, RecordingError
+from needletrack.errors import CalibrationError, NeedletrackError, RecordingError
+from needletrack.reading import opened, picture, text_of, yaml_document
 from needletrack.recording.asl import ListedFrame, ListedPair, Loss, UnusablePair
 from needletrack.recording.mcap_file import (
     LEFT_TOPIC,
@@ -25,6 +34,8 @@ from needletrack.recording.mcap_file import (
     image_cdr,
     size_only_rig,
     typestore,
+    unpacked_by,
+    unpacked_zstd,
 )
 from needletrack.recording.pairing import in_order, pair_by_stamp
 from needletrack.recording.replay import StoredRecording
@@ -42,6 +53,8 @@ _TO_GRAY = {
     "bgra8": cv2.COLOR_BGRA2GRAY,
 }
 _GRAY = {"mono8", "8UC1"}
+_GREATEST_STAMP = 2**63 - 1
+_METADATA = "metadata.yaml"
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,10 +87,11 @@ class BagRecording:
             raise CalibrationError(f"{self.folder}: a bag holds no rig: name one with --rig")
         # Board pictures are read by several threads; the reader is one file with one place in it.
         self._lock = Lock()
-        self._reader = _opened(self.folder)
-        self._close_reader = weakref.finalize(self, self._reader.close)
-        self._topics = _two_topics(self.folder, self._reader, topics)
-        stored = [self._stamps(connection) for connection in self._topics]
+        with _refused(self.folder):
+            self._reader = _opened(self.folder)
+            self._close_reader = weakref.finalize(self, self._reader.close)
+            self._topics = _two_topics(self.folder, self._reader, topics)
+            stored = [self._stamps(connection) for connection in self._topics]
         ordered = [[frames[i] for i in in_order([frame.stamp_ns for frame in frames])] for frames in stored]
         left, right = ([frame.stamp_ns for frame in frames] for frames in ordered)
         near = pair_by_stamp(left, right, round(tolerance_us * 1000))
@@ -111,9 +125,10 @@ class BagRecording:
         )
         for connection, stored, unpaired in sides:
             try:
-                image = _gray(self._message(connection, stored))
-            except ValueError as error:
-                losses.append(Loss(DropReason.UNREADABLE_IMAGE, self.folder, f"pair {index}: {error}", index))
+                with _refused(self.folder):
+                    image = _gray(self._message(connection, stored))
+            except RecordingError as error:
+                losses.append(Loss(DropReason.UNREADABLE_IMAGE, self.folder, f"pair {index}: {error.__cause__}", index))
                 continue
             if image.shape != size_px[::-1]:
                 fault = f"pair {index}: the image is {image.shape[1]}x{image.shape[0]}, the rig says {size_px}"
@@ -134,15 +149,18 @@ class BagRecording:
     def _stamps(self, connection: Connection) -> list[_Stored]:
         found = []
         for _, recorded_ns, raw in self._reader.messages([connection]):
-            stamp = self._deserialized(connection, raw).header.stamp
-            found.append(_Stored(stamp.sec * 1_000_000_000 + stamp.nanosec, recorded_ns))
+            stamp_ns = _stamp_ns(self._deserialized(connection, raw))
+            if not 0 <= stamp_ns <= _GREATEST_STAMP:
+                raise ValueError(f"a stamp of {stamp_ns} ns in {connection.topic}")
+            found.append(_Stored(stamp_ns, recorded_ns))
         return found
 
     def _first_size_px(self) -> tuple[int, int]:
         try:
-            height, width = _gray(self._message(self._topics[0], self._stored[0][0])).shape
-        except ValueError as error:
-            raise RecordingError(f"{self.folder}: its first image cannot be read: {error}") from error
+            with _refused(self.folder):
+                height, width = _gray(self._message(self._topics[0], self._stored[0][0])).shape
+        except RecordingError as error:
+            raise RecordingError(f"{self.folder}: its first image cannot be read: {error.__cause__}") from error
         return width, height
 
     def _message(self, connection: Connection, stored: _Stored) -> Any:
@@ -150,17 +168,39 @@ class BagRecording:
         with self._lock:
             for _, _, raw in self._reader.messages([connection], start=at, stop=at + 1):
                 message = self._deserialized(connection, raw)
-                if message.header.stamp.sec * 1_000_000_000 + message.header.stamp.nanosec == stored.stamp_ns:
+                if _stamp_ns(message) == stored.stamp_ns:
                     return message
         raise ValueError("the image is not there any more")
 
     def _deserialized(self, connection: Connection, raw: bytes) -> Any:
-        return self._reader.deserialize(raw, connection.msgtype)
+        # By ROS's own definition of the type, not by the one in the bag, which may call a stamp's seconds a text.
+        if self._reader.is2:
+            return typestore().deserialize_cdr(raw, connection.msgtype)
+        return _ROS1.deserialize_ros1(raw, connection.msgtype)
+
+
+_ROS1 = get_typestore(Stores.ROS1_NOETIC)
+
+
+def _stamp_ns(message: Any) -> int:
+    return int(message.header.stamp.sec) * 1_000_000_000 + int(message.header.stamp.nanosec)
+
+
+@contextmanager
+def _refused(path: Path) -> Iterator[None]:
+    """Whatever a damaged bag makes its reader say becomes a RecordingError, whose cause it is."""
+    try:
+        yield
+    except NeedletrackError:
+        raise
+    except Exception as error:
+        told = f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
+        raise RecordingError(f"{path}: cannot be read as a ROS bag: {told}") from error
 
 
 def is_bag(path: Path) -> bool:
     """Whether a path looks like a ROS bag: a ROS 1 file, a ROS 2 folder or file."""
-    return path.suffix in (".bag", ".db3", ".mcap") or (path / "metadata.yaml").is_file()
+    return path.suffix in (".bag", ".db3", ".mcap") or (path / _METADATA).is_file()
 
 
 @dataclass(frozen=True, slots=True)
@@ -268,12 +308,47 @@ def _camera_info(rig: Rig, number: int, stamp_ns: int, frame_id: str) -> bytes:
 def _opened(path: Path) -> AnyReader:
     if not path.exists():
         raise RecordingError(f"{path}: there is no such recording")
-    try:
-        reader = AnyReader([path], default_typestore=typestore())
-        reader.open()
-    except AnyReaderError as error:
-        raise RecordingError(f"{path}: cannot be read as a ROS bag: {error}") from error
+    _require_plain(path)
+    reader = AnyReader([path], default_typestore=typestore())
+    reader.open()
     return reader
+
+
+def _require_plain(path: Path) -> None:
+    """Refuse what would make the reader wait (a FIFO) or multiply (aliases in metadata.yaml)."""
+    files = sorted(path.iterdir()) if path.is_dir() else [path]
+    for file in files:
+        try:
+            if not file.is_dir():
+                opened(file).close()
+            if file.name == _METADATA:
+                yaml_document(text_of(file))
+        except OSError as error:
+            raise RecordingError(f"{file}: cannot be read: {error.strerror or error}") from error
+        except ValueError as error:
+            raise RecordingError(f"{file}: not the metadata of a bag: {error}") from error
+
+
+def _bound_decompression() -> None:
+    """Let no chunk or message of a bag grow beyond what a few pictures take: the library sets no limit."""
+
+    def unpacked_lz4(data: bytes) -> bytes:
+        return unpacked_by(lz4.frame.LZ4FrameDecompressor(), data)
+
+    mcap_formats = rosbags.rosbag2.storage_mcap.DECOMPRESSORS
+    mcap_formats["zstd"] = lambda data, size: unpacked_zstd(data)
+    mcap_formats["lz4"] = lambda data, size: unpacked_lz4(data)
+    bag1_formats = rosbags.rosbag1.reader.decompressors
+    bag1_formats["bz2"] = lambda data: unpacked_by(bz2.BZ2Decompressor(), data)
+    bag1_formats["lz4"] = unpacked_lz4
+    # A bag that is compressed as a whole goes to a temporary file, not to memory.
+    whole_files = rosbags.rosbag2.reader.zstd.open  # type: ignore[attr-defined]
+    rosbags.rosbag2.reader.zstd = SimpleNamespace(  # type: ignore[attr-defined, assignment]
+        decompress=unpacked_zstd, open=whole_files
+    )
+
+
+_bound_decompression()
 
 
 def _two_topics(path: Path, reader: AnyReader, topics: tuple[str, str] | None) -> tuple[Connection, Connection]:
@@ -297,11 +372,10 @@ def _two_topics(path: Path, reader: AnyReader, topics: tuple[str, str] | None) -
 def _gray(message: Any) -> Image:
     """The picture of a message as 8-bit gray (rows, columns), read-only; ValueError where it cannot be decoded."""
     if not hasattr(message, "encoding"):
-        decoded = cv2.imdecode(np.frombuffer(message.data, np.uint8), cv2.IMREAD_UNCHANGED)
-        if decoded is None:
-            raise ValueError(f"a compressed image of format {message.format!r} that cannot be decoded")
-        pixels: Any = decoded
-        encoding = {2: "mono8", 3: "bgr8"}[pixels.ndim] if pixels.dtype == np.uint8 else "mono16"
+        pixels: Any = picture(message.data)
+        if pixels.ndim == 3:
+            pixels = cv2.cvtColor(pixels, cv2.COLOR_BGRA2GRAY if pixels.shape[2] == 4 else cv2.COLOR_BGR2GRAY)
+        encoding = "mono8" if pixels.dtype == np.uint8 else "mono16"
     else:
         encoding = message.encoding
         pixels = _raw(message)

@@ -29,6 +29,7 @@ from needletrack.calibration.worth import (
     space_grid_mm,
 )
 from needletrack.errors import CalibrationError, RecordingError
+from needletrack.reading import bytes_of, picture, text_of
 from needletrack.recording.asl import UnusablePair
 from needletrack.recording.bag import is_bag
 from needletrack.recording.replay import ReplaySource, StoredRecording
@@ -46,6 +47,7 @@ _FILM_S = 0.5
 # Looked at in each stretch of a film, and how much smaller, to find the stillest pair.
 _TRIED, _SMALLER = 6, 8
 _LISTING_HEADER = "#timestamp [ns],filename\n"
+_MOST_PICTURE_BYTES = 1 << 29
 
 
 class BoardPictures(Protocol):
@@ -336,7 +338,7 @@ class BoardRecorder:
         for camera in ("cam0", "cam1"):
             listing = folder / camera / "data.csv"
             try:
-                if listing.exists() and listing.read_text(encoding="utf-8") != _LISTING_HEADER:
+                if listing.exists() and text_of(listing, _MOST_PICTURE_BYTES) != _LISTING_HEADER:
                     raise RecordingError(f"{listing}: there is a recording already: name a new folder")
                 (folder / camera / "data").mkdir(parents=True, exist_ok=True)
                 listing.write_text(_LISTING_HEADER, encoding="utf-8")
@@ -398,13 +400,11 @@ def _numbered(folder: Path, prefix: str) -> dict[tuple[int, ...], Path]:
 
 def _gray(path: Path) -> Image:
     try:
-        data = np.frombuffer(path.read_bytes(), np.uint8)
+        return np.asarray(picture(bytes_of(path, _MOST_PICTURE_BYTES), cv2.IMREAD_GRAYSCALE), dtype=np.uint8)
     except OSError as error:
         raise RecordingError(f"{path}: cannot be read: {error.strerror or error}") from error
-    image = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE) if len(data) else None
-    if image is None:
-        raise RecordingError(f"{path}: its pixels cannot be decoded")
-    return np.asarray(image, dtype=np.uint8)
+    except ValueError as error:
+        raise RecordingError(f"{path}: {error}") from error
 
 
 def _significant(value: float) -> float:

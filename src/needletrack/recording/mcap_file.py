@@ -9,6 +9,7 @@ import os
 import struct
 import time
 import weakref
+import zlib
 from collections import OrderedDict
 from collections.abc import Mapping
 from contextlib import suppress
@@ -20,6 +21,7 @@ from threading import Lock
 from types import SimpleNamespace
 from typing import IO, Any, cast
 
+import lz4.frame
 import mcap.writer
 import numpy as np
 import zstandard
@@ -27,8 +29,8 @@ from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.reader import make_reader
-from mcap.records import Attachment, Channel, Chunk, ChunkIndex, Message, MessageIndex, Metadata, Schema
-from mcap.stream_reader import StreamReader, get_chunk_data_stream
+from mcap.records import Attachment, Channel, Chunk, ChunkIndex, McapRecord, Message, MessageIndex, Metadata, Schema
+from mcap.stream_reader import StreamReader
 from mcap.writer import CompressionType, Writer
 from rosbags.typesys import Stores, get_typestore
 from rosbags.typesys.store import Typestore
@@ -36,6 +38,7 @@ from rosbags.typesys.store import Typestore
 from needletrack.errors import CalibrationError, RecordingError
 from needletrack.geometry.camera import Camera
 from needletrack.geometry.transform import RigidTransform
+from needletrack.reading import opened
 from needletrack.recording.asl import ListedFrame, ListedPair, Loss, UnusablePair
 from needletrack.records import Clock, DropReason, Frame, Image, StampPlace, StereoPair
 from needletrack.rig import Rig, rig_from_text, rig_text
@@ -78,7 +81,14 @@ _QOS = """\
 # The name of what is recorded before there is a rig.
 UNCALIBRATED = "uncalibrated"
 # What reading a file raises whose end is missing.
-_CUT_OFF = (McapError, struct.error, ValueError, zstandard.ZstdError, KeyError)
+_CUT_OFF = (
+    *(McapError, struct.error, ValueError, zstandard.ZstdError, KeyError),
+    # Of one that lies about its lengths.
+    *(OverflowError, MemoryError, RuntimeError, IndexError, TypeError, AttributeError),
+)
+# Of a chunk, once decompressed: a writer ends it after the picture that fills it.
+_MOST_CHUNK_BYTES = 1 << 28
+_GREATEST_STAMP = 2**63 - 1
 
 
 @cache
@@ -233,7 +243,7 @@ class McapRecording:
         self._lock = Lock()
         self._cached: OrderedDict[int, bytes] = OrderedDict()
         try:
-            self._file = self.folder.open("rb")
+            self._file = opened(self.folder)
         except OSError as error:
             raise RecordingError(f"{self.folder}: cannot be read: {error.strerror or error}") from error
         self._close_file = weakref.finalize(self, self._file.close)
@@ -316,8 +326,7 @@ class McapRecording:
                 return self._cached[number]
             self._file.seek(self._chunks[number].chunk_start_offset + 9)
             chunk = Chunk.read(ReadDataStream(self._file))
-            stream, length = get_chunk_data_stream(chunk, validate_crc=True)
-            self._cached[number] = stream.read(length)
+            self._cached[number] = _content(chunk)
             while len(self._cached) > self._CHUNKS_KEPT:
                 self._cached.popitem(last=False)
             return self._cached[number]
@@ -330,6 +339,9 @@ class McapRecording:
                 raise RecordingError(_cut_off(self.folder))
             abouts = [record.metadata for record in reader.iter_metadata() if record.name == ABOUT]
             attachments = {record.name: record.data for record in reader.iter_attachments()}
+            topics = {channel_id: channel.topic for channel_id, channel in summary.channels.items()}
+            chunks = sorted(summary.chunk_indexes, key=lambda chunk: chunk.chunk_start_offset)
+            places = self._places_in(chunks, topics)
         except (OSError, *_CUT_OFF) as error:
             if not self.folder.stat().st_size:
                 raise RecordingError(f"{self.folder}: the file is empty") from error
@@ -338,17 +350,26 @@ class McapRecording:
             raise RecordingError(
                 f"{self.folder}: an MCAP file, but no recording of needletrack's: `needletrack import`"
             )
-        topics = {channel_id: channel.topic for channel_id, channel in summary.channels.items()}
+        try:
+            return _about(self.folder, abouts[0], attachments), places, chunks
+        except (RecursionError, *_CUT_OFF) as error:
+            raise RecordingError(
+                f"{self.folder}: what the file says of itself cannot be read ({error}): record it anew, or "
+                "`needletrack export` the pictures of another copy"
+            ) from error
+
+    def _places_in(self, chunks: list[ChunkIndex], topics: Mapping[int, str]) -> dict[str, list[_Place]]:
         places: dict[str, list[_Place]] = {LEFT_TOPIC: [], RIGHT_TOPIC: [], TRACK_TOPIC: []}
-        chunks = sorted(summary.chunk_indexes, key=lambda chunk: chunk.chunk_start_offset)
         for number, chunk in enumerate(chunks):
             for channel_id, offset in chunk.message_index_offsets.items():
                 if topics[channel_id] not in places:
                     continue
                 self._file.seek(offset + 9)
                 entries = MessageIndex.read(ReadDataStream(self._file)).records
+                if any(stamp > _GREATEST_STAMP for stamp, _ in entries):
+                    raise ValueError("a stamp that no clock has")
                 places[topics[channel_id]] += [_Place(number, at, stamp) for stamp, at in entries]
-        return _about(self.folder, abouts[0], attachments), places, chunks
+        return places
 
     def _check_size(self) -> None:
         width, height = self._size_px(self._places[0][0])
@@ -384,14 +405,14 @@ def recover(damaged: Path, output: Path) -> Recovered:
     if output.exists():
         raise RecordingError(f"{output} exists already: name another file, nothing is overwritten")
     try:
-        source = damaged.open("rb")
+        source = opened(damaged)
     except OSError as error:
         raise RecordingError(f"{damaged}: cannot be read: {error.strerror or error}") from error
     with source, output.open("xb") as file:
         copy = _Copy(_fast_writer(file))
         whole_until = 0
         try:
-            for record in StreamReader(source, emit_chunks=True, validate_crcs=True).records:
+            for record in _Records(source, emit_chunks=True, validate_crcs=True).records:
                 copy.add(record)
                 whole_until = source.tell()
         except _CUT_OFF:
@@ -403,6 +424,18 @@ def recover(damaged: Path, output: Path) -> Recovered:
         raise RecordingError(f"{damaged}: nothing in it could be read: no MCAP file, or cut off before its first pair")
     pairs = min(copy.counts.get(LEFT_TOPIC, 0), copy.counts.get(RIGHT_TOPIC, 0))
     return Recovered(pairs, copy.counts.get(TRACK_TOPIC, 0), lost)
+
+
+class _Records(StreamReader):
+    """Records up to the first that was never written: a file system may leave zeros there after a power cut.
+
+    The library takes nine zeros for a record of no kind and no length, and reads on: an hour for 10 GB.
+    """
+
+    def _read_record(self, opcode: int, length: int) -> McapRecord | None:
+        if opcode == 0:
+            raise McapError("zeros in place of a record")
+        return super()._read_record(opcode, length)
 
 
 class _Copy:
@@ -420,8 +453,9 @@ class _Copy:
             self._writer.start(PROFILE, library=_LIBRARY)
             self._started = True
         if isinstance(record, Chunk):
-            stream, length = get_chunk_data_stream(record, validate_crc=True)
-            while stream.count < length:
+            content = _content(record)
+            stream = ReadDataStream(BytesIO(content))
+            while stream.count < len(content):
                 opcode, size = stream.read1(), stream.read8()
                 self._add_inner(opcode, size, stream)
         elif isinstance(record, Attachment):
@@ -465,10 +499,51 @@ def _fast_writer(file: IO[bytes]) -> Writer:
     return Writer(file, chunk_size=_CHUNK_BYTES, compression=CompressionType.ZSTD, enable_crcs=False)
 
 
+def unpacked_zstd(data: bytes) -> bytes:
+    """What a zstd frame holds; ValueError where it claims more than a quarter of a gigabyte, or is damaged."""
+    size = zstandard.frame_content_size(data)
+    if size > _MOST_CHUNK_BYTES:
+        raise ValueError(f"a part claims to hold {size / 1e9:.1f} GB")
+    try:
+        return unpacked_by(zstandard.ZstdDecompressor(), data) if size < 0 else zstandard.decompress(data)
+    except zstandard.ZstdError as error:
+        raise ValueError(str(error)) from error
+
+
+def unpacked_by(decompressor: Any, data: bytes) -> bytes:
+    """What a decompressor of bz2, lz4 or zstandard makes of data; ValueError above a quarter of a gigabyte."""
+    if isinstance(decompressor, zstandard.ZstdDecompressor):
+        with decompressor.stream_reader(data) as reader:
+            content, whole = reader.read(_MOST_CHUNK_BYTES), not reader.read(1)
+    else:
+        content = decompressor.decompress(data, _MOST_CHUNK_BYTES)
+        whole = decompressor.eof
+    if not whole:
+        raise ValueError(f"a part is cut off, or holds more than {_MOST_CHUNK_BYTES >> 20} MB")
+    return bytes(content)
+
+
+def _content(chunk: Chunk) -> bytes:
+    """What a chunk holds, its checksum compared; raises one of _CUT_OFF."""
+    if chunk.uncompressed_size > _MOST_CHUNK_BYTES:
+        raise ValueError(f"a chunk claims to hold {chunk.uncompressed_size / 1e9:.1f} GB")
+    if chunk.compression == "zstd":
+        data = unpacked_zstd(chunk.data)
+    elif chunk.compression == "lz4":
+        data = unpacked_by(lz4.frame.LZ4FrameDecompressor(), chunk.data)
+    else:
+        data = chunk.data
+    if len(data) != chunk.uncompressed_size:
+        raise ValueError(f"a chunk holds {len(data)} bytes and claims {chunk.uncompressed_size}")
+    if chunk.uncompressed_crc and zlib.crc32(data) != chunk.uncompressed_crc:
+        raise ValueError("the checksum of a chunk is wrong")
+    return data
+
+
 def is_recording(path: Path) -> bool:
     """Whether a file is a recording of ours, whole or cut off; by its beginning."""
     try:
-        with path.open("rb") as file:
+        with opened(path) as file:
             for number, record in enumerate(StreamReader(BytesIO(file.read(1 << 20)), emit_chunks=True).records):
                 if isinstance(record, Metadata):
                     return record.name == ABOUT
@@ -501,13 +576,14 @@ def _as_metadata(about: About) -> dict[str, str]:
 def _about(path: Path, metadata: Mapping[str, str], attachments: Mapping[str, bytes]) -> About:
     values = {key: json.loads(value) for key, value in metadata.items()}
     rig = attachments.get(RIG_ATTACHMENT)
+    exposure_ns = values["exposure_ns"]
     return About(
         rig=None if rig is None else rig_from_text(rig.decode(), path / RIG_ATTACHMENT),
-        name=values["name"],
-        run_id=values["run_id"],
+        name=str(values["name"]),
+        run_id=str(values["run_id"]),
         config=attachments.get(CONFIG_ATTACHMENT, b"").decode(),
         clock=Clock(values["clock"]),
-        exposure_ns=values["exposure_ns"],
+        exposure_ns=None if exposure_ns is None else int(exposure_ns),
         stamp_at=None if values["stamp_at"] is None else StampPlace(values["stamp_at"]),
     )
 

@@ -4,13 +4,12 @@ import os
 import struct
 import zlib
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 
 from needletrack.errors import RecordingError
+from needletrack.reading import opened, picture
 from needletrack.records import DropReason, Image
 
 _SIGNATURE = b"\x89PNG\r\n\x1a\n"
@@ -32,7 +31,7 @@ class UnusableImage(RecordingError):
 def png_size(path: Path) -> tuple[int, int] | None:
     """Width and height that a file's PNG header claims; None where there is no such header or file."""
     try:
-        with path.open("rb") as file:
+        with opened(path) as file:
             return _size_in(file.read(_HEADER_BYTES))
     except OSError:
         return None
@@ -47,7 +46,7 @@ def read_gray(path: Path, size_px: tuple[int, int]) -> Image:
     """
     width, height = size_px
     try:
-        with path.open("rb") as file:
+        with opened(path) as file:
             header = file.read(_HEADER_BYTES)
             size = _size_in(header)
             if size is None:
@@ -64,15 +63,10 @@ def read_gray(path: Path, size_px: tuple[int, int]) -> Image:
         raise UnusableImage(path, DropReason.MISSING_IMAGE, "there is no such image") from None
     except OSError as error:
         raise UnusableImage(path, DropReason.UNREADABLE_IMAGE, error.strerror or str(error)) from error
-    if damage := _damage(data):
-        raise UnusableImage(path, DropReason.UNREADABLE_IMAGE, damage)
     try:
-        decoded = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
-    except cv2.error as error:
-        raise UnusableImage(path, DropReason.UNREADABLE_IMAGE, f"cannot be decoded: {error}") from error
-    if decoded is None:
-        raise UnusableImage(path, DropReason.UNREADABLE_IMAGE, "its pixels cannot be decoded")
-    pixels: npt.NDArray[Any] = decoded
+        pixels = picture(data)
+    except ValueError as error:
+        raise UnusableImage(path, DropReason.UNREADABLE_IMAGE, str(error)) from error
     if pixels.ndim == 3:
         pixels = cv2.cvtColor(pixels, cv2.COLOR_BGRA2GRAY if pixels.shape[2] == 4 else cv2.COLOR_BGR2GRAY)
     gray: Image = (pixels >> 8 if pixels.dtype == np.uint16 else pixels).astype(np.uint8, copy=False)
@@ -86,19 +80,3 @@ def _size_in(header: bytes) -> tuple[int, int] | None:
         return None
     width, height = struct.unpack(">II", header[16:24])
     return width, height
-
-
-def _damage(data: bytes) -> str | None:
-    """What is wrong with the chunks of a PNG (ISO/IEC 15948, section 5); None where they are whole."""
-    at = len(_SIGNATURE)
-    while at + 12 <= len(data):
-        length, kind = struct.unpack(">I4s", data[at : at + 8])
-        end = at + 12 + length
-        if end > len(data):
-            break
-        if zlib.crc32(data[at + 4 : end - 4]) != int.from_bytes(data[end - 4 : end], "big"):
-            return f"corrupt: wrong checksum of the part at byte {at}"
-        if kind == b"IEND":
-            return None
-        at = end
-    return f"truncated: it ends within a part, after {len(data)} bytes"

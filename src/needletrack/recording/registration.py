@@ -3,6 +3,7 @@
 import csv
 from dataclasses import dataclass, replace
 from datetime import datetime
+from io import StringIO
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from needletrack.calibration.registration import RobotRegistration, register_points, register_poses
 from needletrack.errors import CalibrationError
+from needletrack.reading import text_of
 from needletrack.records import Float
 from needletrack.rig import Registration, Rig
 
@@ -17,6 +19,7 @@ RIG = ("rig_x_mm", "rig_y_mm", "rig_z_mm")
 ROBOT = ("robot_x_mm", "robot_y_mm", "robot_z_mm")
 QUATERNION = ("robot_qx", "robot_qy", "robot_qz", "robot_qw")
 _UNIT = 1e-2
+_MOST_BYTES = 50_000_000
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,7 +37,7 @@ class PointPairs:
 def read_pairs(path: Path) -> PointPairs:
     """The pairs of a CSV file with a head; raises CalibrationError that names the line."""
     try:
-        with path.open(encoding="utf-8-sig", newline="") as file:
+        with StringIO(text_of(path, _MOST_BYTES, "utf-8-sig"), newline="") as file:
             reader = csv.DictReader(file, skipinitialspace=True)
             head = [name.strip() for name in reader.fieldnames or ()]
             reader.fieldnames = head
@@ -53,7 +56,8 @@ def read_pairs(path: Path) -> PointPairs:
     table = np.array(rows, dtype=np.float64).reshape(-1, 6 + len(poses))
     rotations = None
     if poses:
-        lengths = np.linalg.norm(table[:, 6:], axis=1)
+        with np.errstate(over="ignore"):
+            lengths = np.linalg.norm(table[:, 6:], axis=1)
         if (wrong := np.flatnonzero(np.abs(lengths - 1) > _UNIT)).size:
             raise CalibrationError(f"{path}: the quaternion of pair {wrong[0] + 1} has length {lengths[wrong[0]]:.3f}")
         rotations = np.asarray(Rotation.from_quat(table[:, 6:]).as_matrix())

@@ -1,0 +1,306 @@
+"""What a fault needs around it: the processes, the link between them, and what the subscriber wrote."""
+
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import IO, Any, Self
+
+import psutil
+
+from benchmarks.loopback import free_endpoint
+
+ROOT = Path(__file__).parents[2]
+RECORDING = ROOT / "tests" / "data" / "recordings" / "steer-b"
+# Only a defect takes so long.
+WAIT_S = 60.0
+_STARTS_WITHIN_S = 90.0
+_FRESH_FOR_S = 0.25
+_NICE = -10
+
+
+class Missed(AssertionError):
+    """What should have happened did not."""
+
+
+def until(condition: Callable[[], Any], what: str, timeout_s: float = WAIT_S) -> Any:
+    """The condition's first true value; raises Missed."""
+    end_s = time.monotonic() + timeout_s
+    while time.monotonic() < end_s:
+        if value := condition():
+            return value
+        time.sleep(0.005)
+    raise Missed(f"{what}: not within {timeout_s:g} s")
+
+
+class Child:
+    """A Python module in a process of its own, ended with the stage."""
+
+    def __init__(self, module: str, *arguments: str) -> None:
+        self.errors = tempfile.TemporaryFile("w+")  # noqa: SIM115
+        env = {
+            **os.environ,
+            "PYTHONPATH": f"{ROOT / 'src'}:{ROOT}",
+            "OMP_NUM_THREADS": "1",
+            "OPENBLAS_NUM_THREADS": "1",
+        }
+        self.process = subprocess.Popen(
+            [sys.executable, "-m", module, *arguments],
+            cwd=ROOT,
+            env=env,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=self.errors,
+            text=True,
+        )
+
+        # Other jobs of a busy machine are not the fault that is looked at.
+        with suppress(PermissionError):
+            os.setpriority(os.PRIO_PROCESS, self.process.pid, _NICE)
+
+    def say(self, *command: object) -> None:
+        """A command to the daemon's cameras."""
+        assert self.process.stdin is not None
+        self.process.stdin.write(json.dumps(command) + "\n")
+        self.process.stdin.flush()
+
+    def signal(self, number: int) -> float:
+        """Send a signal; when."""
+        self.process.send_signal(number)
+        return time.monotonic()
+
+    def recorder(self) -> int:
+        """The process that a daemon writes its recording with."""
+        found = (
+            child.pid for child in psutil.Process(self.process.pid).children() if "spawn_main" in str(child.cmdline())
+        )
+        return int(until(lambda: next(found, None), "a recording process"))
+
+    def stderr(self) -> str:
+        """What it wrote to stderr so far."""
+        self.errors.seek(0)
+        return self.errors.read()
+
+    def close(self) -> None:
+        """Kill what still runs."""
+        with suppress(ProcessLookupError):
+            self.process.send_signal(signal.SIGCONT)
+        self.process.kill()
+        self.process.wait()
+        for pipe in (self.process.stdin, self.process.stdout, self.errors):
+            with suppress(OSError, ValueError):
+                assert pipe is not None
+                pipe.close()
+
+
+class Watcher(Child):
+    """The subscriber, and what it wrote so far."""
+
+    def __init__(self, rig: str, *endpoints: str, mode: str = "peer") -> None:
+        super().__init__("benchmarks.faults.watcher", mode, rig, *endpoints)
+        self.seen: list[dict[str, Any]] = []
+        self._reader = threading.Thread(target=self._read, daemon=True)
+        self._reader.start()
+
+    def _read(self) -> None:
+        """Take its lines until it ends, which it does on its own only by a defect."""
+        assert self.process.stdout is not None
+        with suppress(ValueError):
+            for line in self.process.stdout:
+                self.seen.append(json.loads(line))
+
+    def since(self, at_s: float, key: str) -> list[dict[str, Any]]:
+        """What it saw of a kind from a moment on."""
+        return [seen for seen in list(self.seen) if key in seen and seen["at_s"] >= at_s]
+
+    def tracks(self, at_s: float, count: int = 10) -> None:
+        """Wait for so many tracks that came after a moment."""
+        until(lambda: len(self.since(at_s, "track")) >= count, f"{count} tracks")
+
+    def health(self, at_s: float, *states: str) -> dict[str, Any]:
+        """The first change of health after a moment to one of these."""
+        found: dict[str, Any] = until(
+            lambda: next((seen for seen in self.since(at_s, "health") if seen["health"] in states), None),
+            " or ".join(states),
+        )
+        return found
+
+    def fresh_after(self, at_s: float) -> float:
+        """Seconds until it called the track fresh again, and kept to it for a moment."""
+
+        def fresh() -> float | None:
+            changes = [seen for seen in list(self.seen) if "health" in seen]
+            tracks = self.since(at_s, "track")
+            if not changes or changes[-1]["health"] != "fresh" or not tracks:
+                return None
+            began_s = max(changes[-1]["at_s"], tracks[0]["at_s"])
+            return began_s - at_s if time.monotonic() - began_s > _FRESH_FOR_S else None
+
+        return float(until(fresh, "a fresh track"))
+
+    def missed(self, since_s: float) -> tuple[int, int, int]:
+        """(dropped by the daemon, lost on the way, overflowed here), of all tracks since a moment."""
+        rows = [seen["missed"] for seen in self.since(since_s, "track")]
+        dropped, lost, overflowed = (sum(row[i] for row in rows) for i in range(3))
+        return dropped, lost, overflowed
+
+    def heartbeat(self, at_s: float, condition: Callable[[dict[str, Any]], Any], what: str) -> dict[str, Any]:
+        """The first heartbeat after a moment for which the condition holds, with `at_s`."""
+
+        def found() -> dict[str, Any] | None:
+            return next((s for s in self.since(at_s, "heartbeat") if condition(s["heartbeat"])), None)
+
+        seen: dict[str, Any] = until(found, what)
+        return seen
+
+    def drops(self) -> dict[str, int]:
+        """The daemon's counts in the newest track."""
+        newest = self.since(0.0, "track")[-1]
+        return dict(newest["dropped"])
+
+
+class Link:
+    """A TCP link between a port here and an endpoint: it can be cut, held and healed."""
+
+    def __init__(self, endpoint: str) -> None:
+        host, port = endpoint.removeprefix("tcp/").split(":")
+        self._to = host, int(port)
+        self._server: socket.socket | None = None
+        self._sockets: set[socket.socket] = set()
+        self.flows = threading.Event()
+        self.flows.set()
+        self.endpoint = free_endpoint()
+        self.heal()
+
+    def heal(self) -> float:
+        """Take connections, pass bytes; when."""
+        self.flows.set()
+        if self._server is None:
+            self._server = socket.create_server(("127.0.0.1", int(self.endpoint.rsplit(":", 1)[1])))
+            threading.Thread(target=self._accept, args=(self._server,), daemon=True).start()
+        return time.monotonic()
+
+    def hold(self) -> float:
+        """Pass no bytes on, and keep the connections; when."""
+        self.flows.clear()
+        return time.monotonic()
+
+    def cut(self) -> float:
+        """Close every connection and take no other; when."""
+        if self._server is not None:
+            with suppress(OSError):
+                self._server.shutdown(socket.SHUT_RDWR)
+            self._server.close()
+        self._server = None
+        for each in list(self._sockets):
+            with suppress(OSError):
+                each.shutdown(socket.SHUT_RDWR)
+            each.close()
+        self._sockets.clear()
+        return time.monotonic()
+
+    def _accept(self, server: socket.socket) -> None:
+        with suppress(OSError):
+            while True:
+                here, _ = server.accept()
+                try:
+                    there = socket.create_connection(self._to)
+                except OSError:
+                    here.close()
+                    continue
+                self._sockets |= {here, there}
+                for one, other in ((here, there), (there, here)):
+                    threading.Thread(target=self._pass, args=(one, other), daemon=True).start()
+
+    def _pass(self, one: socket.socket, other: socket.socket) -> None:
+        with suppress(OSError):
+            while data := one.recv(1 << 16):
+                self.flows.wait()
+                other.sendall(data)
+        for each in (one, other):
+            with suppress(OSError):
+                each.shutdown(socket.SHUT_RDWR)
+
+
+@dataclass
+class Stage:
+    """One fault's surroundings; everything on it ends with it."""
+
+    folder: Path
+    opened: ExitStack = field(default_factory=ExitStack)
+    rig: str = field(default_factory=lambda: f"faults-{os.getpid()}")
+    endpoint: str = field(default_factory=free_endpoint)
+
+    @classmethod
+    @contextmanager
+    def set(cls) -> Iterator[Self]:
+        """A stage with an empty folder."""
+        with tempfile.TemporaryDirectory(prefix="needletrack-faults-") as name:
+            stage = cls(Path(name))
+            with stage.opened:
+                yield stage
+
+    def daemon(self, *arguments: str, listen: bool = True) -> Child:
+        """A daemon, started and not waited for."""
+        here = ["--listen", self.endpoint] if listen else []
+        command = [str(RECORDING), "--name", self.rig, *here, *arguments]
+        return self._child(Child("benchmarks.faults.daemon", *command))
+
+    def watcher(self, *endpoints: str, mode: str = "peer") -> Watcher:
+        """A subscriber, started and not waited for; mode: client of a router, or peer."""
+        watcher = Watcher(self.rig, *(endpoints or (self.endpoint,)), mode=mode)
+        self.opened.callback(watcher.close)
+        return watcher
+
+    def router(self) -> Child:
+        """A router at the stage's endpoint."""
+        return self._child(Child("benchmarks.faults.router", self.endpoint))
+
+    def link(self) -> Link:
+        """A link to the stage's endpoint."""
+        link = Link(self.endpoint)
+        self.opened.callback(link.cut)
+        return link
+
+    def running(self, *arguments: str) -> tuple[Child, Watcher]:
+        """A daemon and a subscriber that calls its tracks fresh."""
+        daemon, watcher = self.daemon(*arguments), self.watcher()
+        fresh(watcher)
+        return daemon, watcher
+
+    def _child(self, child: Child) -> Child:
+        self.opened.callback(child.close)
+        return child
+
+
+def fresh(watcher: Watcher) -> None:
+    """Wait for the first tracks of a stage, and for the rate to be known."""
+
+    def enough() -> bool:
+        if watcher.process.poll() is not None:
+            raise Missed(f"the subscriber ended: {watcher.stderr()[-500:]}")
+        return len(watcher.since(0.0, "track")) >= 20
+
+    until(enough, "the first tracks", _STARTS_WITHIN_S)
+    watcher.fresh_after(time.monotonic())
+
+
+def ended(child: Child, timeout_s: float = WAIT_S) -> int:
+    """A child's exit code, once it has ended."""
+    return child.process.wait(timeout_s)
+
+
+def said_last(file: IO[str] | None) -> dict[str, Any]:
+    """The last line that a daemon wrote to stdout."""
+    assert file is not None
+    summary: dict[str, Any] = json.loads(file.read().splitlines()[-1])
+    return summary

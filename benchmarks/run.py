@@ -31,6 +31,7 @@ def run(plan: Plan, console: Console) -> Report:
     parts: dict[str, Any] = {}
     bars: list[Bar] = []
     with one_thread(), Progress(*columns, console=console, disable=not console.is_terminal) as progress:
+        machine = Machine.here()
 
         def task(name: str, total: int | None) -> Callable[[], None]:
             return partial(progress.advance, progress.add_task(name, total=total))
@@ -73,8 +74,6 @@ def run(plan: Plan, console: Console) -> Report:
             task("start", None)
             start = parts["start"] = measure_start(small.pairs[0], small.rig, plan.starts)
             bars.extend(of_start(start))
-        # At the end: a library's threads are known once it is loaded.
-        machine = Machine.here()
     return Report(
         smoke=plan.smoke,
         machine=machine,

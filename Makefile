@@ -13,7 +13,7 @@ CODE = $(wildcard src tests tools benchmarks hatch_build.py)
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help env demo test test-slow test-hardware lint format types bench bench-smoke soak fanout fuzz faults accuracy accuracy-page peers table1 schema lock clean
+.PHONY: help env demo test test-slow test-hardware lint format types bench bench-smoke bench-compare soak fanout fuzz faults accuracy accuracy-page peers table1 schema lock clean
 
 help:  ## list the targets
 	@awk -F ':.*## ' '/^[a-z0-9-]+:.*## / { printf "  make %-12s %s\n", $$1, $$2 }' Makefile
@@ -65,11 +65,15 @@ format: $(INSTALLED)  ## let ruff lay out the code and mend what it can
 types: $(INSTALLED)  ## mypy --strict
 	$(BIN)/mypy --strict $(CODE)
 
-bench: $(INSTALLED)  ## time per stage and pair, throughput, memory, ratio to the reference method
-	@$(BIN)/python -m benchmarks
+bench: $(INSTALLED)  ## time, latency, throughput, memory, start, each beside its bar; kept in build/bench
+	@$(BIN)/python -m benchmarks $(ARGS)
 
 bench-smoke: $(INSTALLED)  ## the same on a few pairs: does the benchmark still run?
 	@$(BIN)/python -m benchmarks --smoke
+
+bench-compare: $(INSTALLED)  ## the core figures of this tree beside another commit's (make bench-compare BASE=HEAD~1)
+	@test -n "$(BASE)" || { echo "make: name the commit to compare with: make bench-compare BASE=HEAD~1" >&2; exit 1; }
+	@$(BIN)/python -m benchmarks.compare $(BASE) $(ARGS)
 
 soak: $(INSTALLED)  ## ten minutes of the live loop at 60 pairs/s with a recorder (make soak ARGS="--minutes 1")
 	@$(BIN)/python -m benchmarks.live $(ARGS)

@@ -18,6 +18,7 @@ LIBRARIES = (
     "needletrack", "numpy", "opencv-python-headless", "scipy", "scikit-image", "pydantic", "eclipse-zenoh",
 )  # fmt: skip
 ROOT = Path(__file__).parents[1]
+HISTORY = ROOT / "build" / "bench"
 
 
 class Machine(BaseModel):
@@ -69,6 +70,12 @@ class Load(BaseModel):
 def now() -> str:
     """This moment, UTC, ISO 8601."""
     return datetime.now(UTC).isoformat(timespec="seconds")
+
+
+def stem(machine: Machine, started_at: str) -> str:
+    """What a run's record is called: commit and time."""
+    commit = (machine.commit or "uncommitted")[:12] + ("-changed" if machine.dirty else "")
+    return f"{commit}-{started_at[:19].replace(':', '').replace('-', '')}"
 
 
 def _cpu() -> str:

@@ -1,22 +1,25 @@
 """Pairs per second of an every-frame replay through the service, with publishing off and on."""
 
 import time
+from collections import Counter
 from collections.abc import Callable
 from contextlib import ExitStack
 from threading import Event
 
-from benchmarks.frames import PreloadedRecording, Scene, looped
 from benchmarks.loopback import START_S, free_endpoint, subscribed
 from benchmarks.plan import Plan
 from benchmarks.report import Throughput
+from benchmarks.worker import run_of
+from benchmarks.worlds import Playing, Sequence
+from needletrack.auditing import AuditedTracker
+from needletrack.daemon.process import settle_memory
 from needletrack.errors import PublishError
-from needletrack.publish.message import RunContext, Source, StatusMessage, TrackMessage
+from needletrack.publish.message import StatusMessage, TrackMessage
 from needletrack.publish.publisher import ZenohPublisher
-from needletrack.records import NeedleTrack, StereoPair
+from needletrack.records import NeedleTrack, Status, StereoPair
 from needletrack.replay import Published
 from needletrack.service import Service, Sink
 from needletrack.tracking.parameters import TrackingParameters
-from needletrack.tracking.track import track_pair
 
 
 class Meter:
@@ -39,44 +42,44 @@ class Meter:
         return (len(counted) - 1) / (counted[-1] - counted[0])
 
 
-def measure_throughput(scene: Scene, plan: Plan, done: Callable[[], None]) -> Throughput:
-    """Runs with publishing off and on in turn, the subscriber connected all the while."""
-    recording = PreloadedRecording(scene.folder)
-    rig, parameters = recording.rig, TrackingParameters()
-    run = RunContext(rig.name, Source.REPLAY, config_digest="benchmark", rig_digest=rig.digest)
-    wanted = plan.warmup_pairs + plan.pairs_per_round
-
-    def tracker(pair: StereoPair, previous: NeedleTrack | None) -> NeedleTrack:
-        return track_pair(pair, rig, parameters, previous)
-
-    def new_service() -> Service:
-        return Service(looped(recording, wanted), tracker, rig, run, every_frame=True, independent=scene.independent)
-
-    service = new_service()
-
-    def status() -> StatusMessage:
-        return service.status()
-
-    rates: dict[bool, list[float]] = {False: [], True: []}
+def measure_throughput(sequence: Sequence, plan: Plan, done: Callable[[], None]) -> Throughput:
+    """Runs with publishing off and on in turn, the subscriber connected all the while, audits in a second process."""
+    rig = sequence.rig
+    run, wanted = run_of(rig), plan.warmup_pairs + plan.pairs_per_round
     with ExitStack() as opened:
+        tracker = opened.enter_context(AuditedTracker(rig, TrackingParameters()))
+        tracker.warm_up()
+
+        def new_service() -> Service:
+            return Service(Playing(sequence), tracker, rig, run, every_frame=True)
+
+        service = new_service()
+
+        def status() -> StatusMessage:
+            return service.status()
+
+        statuses: Counter[Status] = Counter()
+        rates: dict[bool, list[float]] = {False: [], True: []}
         endpoint = free_endpoint()
         delivery = opened.enter_context(subscribed(rig.name, endpoint))
         with ZenohPublisher(run, status, listen=[endpoint]) as publisher:
             if not publisher.wait_for_subscriber(START_S):
                 raise PublishError(f"the subscriber's process did not connect to {endpoint} in {START_S:g} s")
+            settle_memory()
             for publishing in (False, True) * plan.rounds:
                 stop = Event()
                 meter = Meter(wanted, stop, done)
                 sinks: list[Sink] = [Published(publisher), meter] if publishing else [meter]
                 service = new_service()
-                service.run(sinks, stop)
+                statuses.update(service.run(sinks, stop).statuses)
                 rates[publishing].append(round(meter.pairs_per_s(plan.warmup_pairs), 3))
         received = delivery.result(START_S)
     return Throughput(
-        scene=scene.name,
+        scene=sequence.name,
         pairs_per_run=plan.pairs_per_round,
         warmup_pairs=plan.warmup_pairs,
         publishing_off=rates[False],
         publishing_on=rates[True],
+        statuses={status.value: statuses[status] for status in Status},
         delivery=received,
     )

@@ -1,44 +1,70 @@
 """Time a pair: needletrack, the method of 2017 and the floor, in turn on the same frames."""
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
+from itertools import islice
 
-from benchmarks.frames import PreloadedRecording, Scene, pairs_of
+from benchmarks.frames import SEQUENCE, PreloadedRecording, Scene, pairs_of
 from benchmarks.measure import Lap, Subject, interleaved
 from benchmarks.plan import Plan
 from benchmarks.report import MethodTimes, SceneTimes, Spread
-from benchmarks.subjects import Decoding, Needletrack, Reading, Reference
+from benchmarks.subjects import Decoding, Reading, Reference, Searching
+from benchmarks.worker import Worker
+from benchmarks.worlds import Sequence
+from needletrack.auditing import AuditedTracker
+from needletrack.records import StereoPair
+from needletrack.rig import Rig
+from needletrack.tracking.parameters import TrackingParameters
 
 OURS, REFERENCE = "needletrack", "reference (2017)"
 READING, DECODING = "read both images once", "decode both PNGs"
 
 
-def measure_times(scene: Scene, plan: Plan, done: Callable[[], None]) -> SceneTimes:
-    """Every method on the same pairs of a scene; `done` is called after each pair, warm-up included."""
+def measure_stills(scene: Scene, plan: Plan, done: Callable[[], None]) -> SceneTimes:
+    """Every method on the pairs of a recording of stills; ours without memory. `done`: after each pair."""
     recording = PreloadedRecording(scene.folder)
-    ours = Needletrack(recording.rig, independent=scene.independent)
-    subjects: dict[str, Subject] = {
-        OURS: ours,
-        REFERENCE: Reference(recording.rig),
-        READING: Reading(),
-        DECODING: Decoding(recording),
-    }
-    pairs = list(pairs_of(recording, plan.warmup_pairs + plan.timed_pairs))
+    pairs = pairs_of(recording, plan.warmup_pairs + plan.stills_pairs)
+    return _measured(
+        scene.name, recording.rig, pairs, Searching(recording.rig), Decoding.of_recording(recording), plan, done
+    )
+
+
+def measure_sequence(sequence: Sequence, plan: Plan, done: Callable[[], None]) -> SceneTimes:
+    """Every method on the same pairs of a sequence, ours as in the live loop; `done`: after each pair."""
+    if sequence.name == SEQUENCE.name:
+        decoding = Decoding.of_recording(PreloadedRecording(SEQUENCE.folder))
+    else:
+        decoding = Decoding.of_pairs(sequence.pairs)
+    with AuditedTracker(sequence.rig, TrackingParameters()) as tracker:
+        tracker.warm_up()
+        pairs = islice(sequence.play(), plan.warmup_pairs + plan.timed_pairs)
+        return _measured(sequence.name, sequence.rig, pairs, Worker(sequence.rig, tracker), decoding, plan, done)
+
+
+def _measured(
+    name: str,
+    rig: Rig,
+    pairs: Iterable[StereoPair],
+    ours: Searching | Worker,
+    decoding: Decoding,
+    plan: Plan,
+    done: Callable[[], None],
+) -> SceneTimes:
+    subjects: dict[str, Subject] = {OURS: ours, REFERENCE: Reference(rig), READING: Reading(), DECODING: decoding}
     laps = interleaved(subjects, pairs, plan.warmup_pairs, done)
-    statuses = Counter(status.value for status in ours.statuses[plan.warmup_pairs :])
     return SceneTimes(
-        scene=scene.name,
-        size_px=recording.rig.left.size_px,
-        independent=scene.independent,
+        scene=name,
+        size_px=rig.left.size_px,
+        independent=isinstance(ours, Searching),
         warmup_pairs=plan.warmup_pairs,
-        statuses=dict(sorted(statuses.items())),
+        statuses=dict(sorted(Counter(status.value for status in ours.statuses[plan.warmup_pairs :]).items())),
         methods={name: _times(of_method) for name, of_method in laps.items() if _found(of_method)},
         speedup=_ratio(laps[OURS], laps[REFERENCE], lambda lap: lap.wall_ms),
         cpu_speedup=_ratio(laps[OURS], laps[REFERENCE], lambda lap: lap.cpu_ms),
     )
 
 
-def _times(laps: Sequence[Lap]) -> MethodTimes:
+def _times(laps: list[Lap]) -> MethodTimes:
     found = _found(laps)
     kinds = sorted({lap.label for lap in found if lap.label})
     return MethodTimes(
@@ -58,7 +84,7 @@ def _times(laps: Sequence[Lap]) -> MethodTimes:
     )
 
 
-def _found(laps: Sequence[Lap]) -> list[Lap]:
+def _found(laps: list[Lap]) -> list[Lap]:
     return [lap for lap in laps if lap.label is not None]
 
 
@@ -67,11 +93,11 @@ def _names(entries: Iterable[Iterable[str]]) -> list[str]:
     return list(dict.fromkeys(name for names in entries for name in names))
 
 
-def _outside_stages(laps: Sequence[Lap]) -> dict[str, Spread]:
+def _outside_stages(laps: list[Lap]) -> dict[str, Spread]:
     rest = [lap.wall_ms - sum(lap.stages_ms.values()) for lap in laps if lap.stages_ms]
     return {"outside the stages": Spread.of(rest)} if rest else {}
 
 
-def _ratio(ours: Sequence[Lap], reference: Sequence[Lap], time_ms: Callable[[Lap], float]) -> Spread | None:
+def _ratio(ours: list[Lap], reference: list[Lap], time_ms: Callable[[Lap], float]) -> Spread | None:
     ratios = [time_ms(b) / time_ms(a) for a, b in zip(ours, reference, strict=True) if b.label is not None]
     return Spread.of(ratios) if ratios else None

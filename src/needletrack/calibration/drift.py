@@ -12,7 +12,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 from scipy.spatial.transform import Rotation
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from needletrack.calibration.board import Board, BoardView
 from needletrack.calibration.bundle import Refit, refit
@@ -176,7 +176,7 @@ def check_views(
     motion, sigma = _motion(rig, free)
     caused = effect(rig, motion, points_mm)
     distances, lengths = _distances(rig, ordered, board)
-    moved = surprise > chi2.isf(_FALSE_ALARM, 6) and caused.error.before_mm > _LEAST_EFFECT_MM
+    moved = surprise > chdtri(6, _FALSE_ALARM) and caused.error.before_mm > _LEAST_EFFECT_MM
     return BoardCheck(
         len(ordered),
         float(np.sqrt((distances**2).mean())),

@@ -458,7 +458,7 @@ static int glanced(const Glance *g, const Eye *eyes, TipView *views, Found *o) {
   double foreseen = line_arc[g->before - 1] + advance, stop = foreseen + g->beyond_mm;
   int64_t n = (int64_t)rint(stop / g->section_mm) + 1;
   n = n < 8 ? 8 : n;
-  if (n > o->room) return NO_MEMORY;
+  if (n > o->room) return NOT_HELD;
   double *at = TAKE(double, n), *points = TAKE(double, 3 * n), *arc = TAKE(double, n), *before_tip = TAKE(double, n),
          *local = TAKE(double, 3 * n), *px = TAKE(double, 2 * n);
   int64_t *width = TAKE(int64_t, n), curve_count = 0;
@@ -629,7 +629,8 @@ static int glanced(const Glance *g, const Eye *eyes, TipView *views, Found *o) {
   double end_mm = tip[0] < moved_arc[n - 1] ? tip[0] : moved_arc[n - 1];
   int64_t count = (int64_t)rint(end_mm / g->spacing_mm) + 1, k = 0;
   count = count < 8 ? 8 : count;
-  if (count > o->room) return NO_MEMORY;
+  /* A curve that became so much longer than it was winds about nothing. */
+  if (count > o->room) return NOT_HELD;
   for (int64_t i = 0; i < count; i++) {
     double here = end_mm * (double)i / (double)(count - 1);
     while (k < n - 2 && moved_arc[k + 1] < here) k++;

@@ -29,9 +29,9 @@ _log = logging.getLogger(__name__)
 
 # An audit begins so many pairs after the one before at the soonest, and what it found is gone on from so long after its
 # pair, by the stamps: at 60 pairs a second, ten pairs after a track has slid it is noticed. A search for a needle that
-# is lost is done sooner. What is not done by then is waited for, but not longer than the last.
+# is lost is done sooner. What is not done by then is waited for, but for half a pair at most: none is lost to it.
 _PAIRS_PER_AUDIT = 5
-_AUDITED_AFTER_NS, _FOUND_AFTER_NS, _WAITED_FOR_S = 80_000_000, 45_000_000, 0.04
+_AUDITED_AFTER_NS, _FOUND_AFTER_NS, _WAITED_FOR_S = 80_000_000, 45_000_000, 0.008
 _PAIRS_BEFORE_WAITING = 2
 # A needle that is lost is looked for where it was for so long, in case something only passed before it.
 _REMEMBERED_NS = 2_000_000_000

@@ -1,6 +1,7 @@
 """The fault table: python -m benchmarks.faults [--update docs/reliability.md] [NAME ...]; `make faults`."""
 
 import argparse
+import os
 import re
 import sys
 import time
@@ -31,6 +32,7 @@ def main(arguments: list[str] | None = None) -> int:
     asked = parser.parse_args(arguments)
     chosen = [each for each in FAULTS if not asked.names or each.group in asked.names or each.name in asked.names]
     lines, failed = [], []
+    loads = [os.getloadavg()[0]]
     for each in chosen:
         began_s = time.monotonic()
         try:
@@ -42,19 +44,21 @@ def main(arguments: list[str] | None = None) -> int:
             traceback.print_exc()
             failed.append(each.name)
             lines.append(f"| **{each.group}**: {each.name} | {each.injected} | **not survived**: {error} | | |")
+        loads.append(os.getloadavg()[0])
         print(f"{lines[-1]}  ({time.monotonic() - began_s:.0f} s)", flush=True)
     if failed:
         print(f"FAILED: {', '.join(failed)}", file=sys.stderr)
     if asked.update is not None:
-        update(asked.update, lines)
+        update(asked.update, lines, loads)
     return 1 if failed else 0
 
 
-def update(page: Path, lines: list[str]) -> None:
+def update(page: Path, lines: list[str], loads: list[float]) -> None:
     """Put the table between the marks of a page."""
     table = _HEAD + "\n".join(lines)
     here = Machine.here()
     when = f"{datetime.now(UTC):%Y-%m-%d} on {here.cores_usable} cores ({here.cpu}), {here.system.split('-with')[0]}"
+    when += f". A minute's load was {loads[0]:.1f} before and {max(loads):.1f} at most, the rows' own included"
     text = page.read_text(encoding="utf-8")
     inside = f"{BEGIN}\nMeasured {when}.\n\n{table}\n{END}"
     page.write_text(re.sub(f"{BEGIN}.*{END}", lambda _: inside, text, flags=re.DOTALL), encoding="utf-8")

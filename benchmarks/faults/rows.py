@@ -9,15 +9,14 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
-from inspect import signature
 from pathlib import Path
 
 import numpy as np
+import psutil
 
 from benchmarks.faults.stage import Child, Link, Missed, Stage, Watcher, ended, fresh, said_last, until
 from benchmarks.loopback import free_endpoint
 from needletrack.capture.v4l2_abi import Request
-from needletrack.client import Subscriber
 from needletrack.daemon.run import ExitCode
 from needletrack.publish.session import MOST_RECEIVED_BYTES, open_session
 from needletrack.recording.mcap_file import McapRecording, recover
@@ -86,15 +85,20 @@ def _silence(watcher: Watcher, since_s: float) -> float:
 # --- the daemon
 
 
-@fault("daemon", "killed", "SIGKILL; started anew at once")
+@fault("daemon", "killed", "SIGKILL while it records; started anew at once")
 def killed(stage: Stage) -> Seen:
-    """Nothing of it runs on."""
-    daemon, watcher = stage.running()
+    """Nothing of it runs on: neither its recorder, nor what audits its tracks, nor memory that they shared."""
+    daemon, watcher = stage.running("--record", str(stage.folder))
+    family, memory = daemon.family(), _shared_memory(daemon)
+    _require(len(memory) == 2 and daemon.recorder() != daemon.auditor(), "it has not both of its processes")
     at_s = daemon.signal(signal.SIGKILL)
     saw = _change(watcher, at_s, "gone")
     ended(daemon)
+    until(lambda: not any(_runs(process) for process in family), "the end of every process of the daemon", 5.0)
+    saw += f"; none of its {len(family)} other processes after {time.monotonic() - at_s:.2f} s"
+    until(lambda: not any(file.exists() for file in memory), "the end of its shared memory", 5.0)
     again_s = time.monotonic()
-    stage.daemon()
+    stage.daemon("--record", str(stage.folder))
     healthy_s = watcher.fresh_after(again_s)
     return Seen(saw, healthy_s, "every pair until it ran again, of which most is starting Python")
 
@@ -134,6 +138,20 @@ def twice(stage: Stage) -> Seen:
     watcher.tracks(time.monotonic())
     _require(code == ExitCode.ALREADY_RUNNING, f"the second ended with {code}")
     return Seen(f"{_changes(watcher, at_s)}; the second ended with exit code {code}", 0.0, _lost(watcher, at_s))
+
+
+@fault("daemon", "the auditing process killed", "SIGKILL to it alone")
+def auditor_killed(stage: Stage) -> Seen:
+    """Tracking goes on without it, and starts another."""
+    daemon, watcher = stage.running()
+    at_s, pid = time.monotonic(), daemon.auditor()
+    os.kill(pid, signal.SIGKILL)
+    until(lambda: all(process.pid != pid for process in daemon.family()), "the end of the auditing process")
+    _require(daemon.auditor() != pid, "it is not another process")
+    again_s = time.monotonic() - at_s
+    watcher.tracks(time.monotonic(), 30)
+    saw = f"{_changes(watcher, at_s)}; another one after {again_s:.1f} s"
+    return Seen(saw, 0.0, f"{_lost(watcher, at_s)}; no track was audited meanwhile")
 
 
 # --- cameras, behind the ioctl edge
@@ -460,6 +478,20 @@ def _require(condition: bool, what: str) -> None:
         raise Missed(what)
 
 
+def _runs(process: psutil.Process) -> bool:
+    """Whether it has not ended; one that nobody has waited for has."""
+    try:
+        return bool(process.status() != psutil.STATUS_ZOMBIE)
+    except psutil.NoSuchProcess:
+        return False
+
+
+def _shared_memory(child: Child) -> set[Path]:
+    """The files of the memory that it shares with its own processes; others of this machine may share some, too."""
+    mapped = Path(f"/proc/{child.process.pid}/maps").read_text(encoding="utf-8").split()
+    return {Path(word) for word in mapped if word.startswith("/dev/shm/psm_")}
+
+
 def _changes(watcher: Watcher, since_s: float) -> str:
     """The states of health since a moment, but for fresh."""
     states = dict.fromkeys(s["health"] for s in watcher.since(since_s, "health") if s["health"] != "fresh")
@@ -495,8 +527,6 @@ def _short(told: str, stage: Stage) -> str:
 
 def _client(stage: Stage) -> Watcher:
     """A subscriber that is a router's client: a router passes nothing on between peers that know of each other."""
-    if "mode" not in signature(Subscriber).parameters:
-        raise NotHere("the subscriber of this version is a peer alone")
     return stage.watcher(mode="client")
 
 

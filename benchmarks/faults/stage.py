@@ -80,10 +80,22 @@ class Child:
 
     def recorder(self) -> int:
         """The process that a daemon writes its recording with."""
-        found = (
-            child.pid for child in psutil.Process(self.process.pid).children() if "spawn_main" in str(child.cmdline())
-        )
-        return int(until(lambda: next(found, None), "a recording process"))
+        return self._spawned(_writes_a_recording, "a recording process")
+
+    def auditor(self) -> int:
+        """The process that a daemon audits its tracks with."""
+        return self._spawned(lambda child: not _writes_a_recording(child), "an auditing process")
+
+    def _spawned(self, condition: Callable[[psutil.Process], bool], what: str) -> int:
+        def found() -> int | None:
+            spawned = [child for child in self.family() if "spawn_main" in " ".join(child.cmdline())]
+            return next((child.pid for child in spawned if condition(child)), None)
+
+        return int(until(found, what))
+
+    def family(self) -> list[psutil.Process]:
+        """The processes that it started and that still run."""
+        return psutil.Process(self.process.pid).children(recursive=True)
 
     def stderr(self) -> str:
         """What it wrote to stderr so far."""
@@ -100,6 +112,10 @@ class Child:
             with suppress(OSError, ValueError):
                 assert pipe is not None
                 pipe.close()
+
+
+def _writes_a_recording(process: psutil.Process) -> bool:
+    return any(file.path.endswith(".mcap") for file in process.open_files())
 
 
 class Watcher(Child):

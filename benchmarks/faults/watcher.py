@@ -18,7 +18,7 @@ _MAX_AGE_S = 0.5
 def main() -> int:
     """Watch until the end of the process."""
     mode, rig, *endpoints = sys.argv[1:]
-    options: dict[str, Any] = {} if mode == "peer" else {"mode": mode}
+    options: dict[str, Any] = {"mode": mode}
     state: Freshness | None = None
     status: StatusMessage | None = None
     undecodable = 0

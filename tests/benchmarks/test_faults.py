@@ -28,9 +28,10 @@ def test_a_table_replaces_the_one_before(tmp_path: Path) -> None:
     row = line(
         Fault("daemon", "killed", "SIGKILL", lambda stage: Seen("", None, "")), Seen("gone | at once", 1.25, "all")
     )
-    update(page, [row])
+    update(page, [row], [0.5, 1.5])
     text = page.read_text()
     assert "| **daemon**: killed | SIGKILL | gone / at once | 1.25 s | all |" in text
+    assert "was 0.5 before and 1.5 at most" in text
     assert "old" not in text
     assert text.startswith("before\n")
     assert text.endswith("after\n")

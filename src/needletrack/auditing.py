@@ -18,6 +18,7 @@ from multiprocessing.shared_memory import SharedMemory
 from types import MappingProxyType, TracebackType
 from typing import Any, Self
 
+import cv2
 import numpy as np
 
 from needletrack.records import Frame, NeedleTrack, StereoPair
@@ -201,6 +202,9 @@ class _Auditor:
         self._shape = (2, height, width)
         self._memory = SharedMemory(create=True, size=2 * width * height)
         self._images: Any = np.ndarray(self._shape, np.uint8, self._memory.buf)
+        # One thread for BLAS and OpenMP, as everywhere here: two that wait for one another take the tracking thread's core.
+        for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
+            os.environ.setdefault(variable, "1")
         context = multiprocessing.get_context("spawn")
         self._pipe, theirs = context.Pipe()
         self._process = context.Process(
@@ -267,6 +271,7 @@ def _audit_pairs(
     # Whoever starts it may be tied to a processor of its own, and must not wait for it.
     os.sched_setaffinity(0, range(os.cpu_count() or 1))
     os.nice(_NICE)
+    cv2.setNumThreads(1)
     memory = SharedMemory(memory_name)
     images: Any = np.ndarray(shape, np.uint8, memory.buf)
     blank = Frame(np.zeros(shape[1:], np.uint8), 0)

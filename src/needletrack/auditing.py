@@ -202,7 +202,7 @@ class _Auditor:
         self._shape = (2, height, width)
         self._memory = SharedMemory(create=True, size=2 * width * height)
         self._images: Any = np.ndarray(self._shape, np.uint8, self._memory.buf)
-        # One thread for BLAS and OpenMP, as everywhere here: two that wait for one another take the tracking thread's core.
+        # One thread for BLAS and OpenMP, as everywhere: two that wait for one another take the tracking thread's core.
         for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
             os.environ.setdefault(variable, "1")
         context = multiprocessing.get_context("spawn")

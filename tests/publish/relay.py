@@ -14,6 +14,7 @@ from typing import Any, Self
 _CHUNK = 16 * 1024
 # Little is on the way inside the relay, so that what is late is so by the link's own fault.
 _BUFFER = 32 * 1024
+_A_MOMENT_S = 0.02
 
 
 class Relay:
@@ -45,7 +46,10 @@ class Relay:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self.cut()
+        # A connection that was being taken as the link was cut is there a moment later, and so is the end of one.
+        for _ in range(2):
+            self.cut()
+            self._do(asyncio.sleep(_A_MOMENT_S))
         self._loop.call_soon_threadsafe(self._loop.stop)
         self._thread.join()
         self._loop.close()
@@ -87,6 +91,9 @@ class Relay:
     async def _accept(self, near: asyncio.StreamReader, to_near: asyncio.StreamWriter) -> None:
         link = asyncio.current_task()
         assert link is not None
+        if self._server is None:
+            to_near.transport.abort()
+            return
         self._links.add(link)
         try:
             with suppress(OSError):

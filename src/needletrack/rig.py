@@ -8,6 +8,7 @@ import hashlib
 import json
 import os
 import re
+import reprlib
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -557,7 +558,7 @@ def _refuse_other_models(path: Path, key: str, entry: object) -> None:
     for part, allowed in (("camera_model", ("pinhole",)), ("distortion_model", ("radtan", "none"))):
         if entry.get(part) not in allowed:
             raise CalibrationError(
-                f"{path}: {key}.{part} is {entry.get(part)!r}, which is not supported: "
+                f"{path}: {key}.{part} is {reprlib.repr(entry.get(part))}, which is not supported: "
                 "calibrate with Kalibr's pinhole-radtan"
             )
 

@@ -5,6 +5,7 @@ to the camera's; metres.
 """
 
 import ast
+import reprlib
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -65,7 +66,7 @@ def _model(path: Path, unit_mm: float) -> tuple[Any, RigidTransform]:
         raise TypeError("no dictionary")
     lens = model["lensmodel"]
     if lens not in _LENSES:
-        raise ValueError(f"{path.name}: {lens} is not supported: {', '.join(_LENSES)}")
+        raise ValueError(f"{path.name}: {reprlib.repr(lens)} is not supported: {', '.join(_LENSES)}")
     fx, fy, cx, cy, *terms = model["intrinsics"]
     if len(terms) != _LENSES[lens]:
         raise ValueError(f"{path.name}: {lens} has {_LENSES[lens]} terms of distortion, not {len(terms)}")

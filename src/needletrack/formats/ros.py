@@ -4,6 +4,7 @@ The pose between the cameras hides in the rectification: R of each camera takes 
 and P of the right camera holds Tx = -f B. Lengths are in the unit of the board's squares, metres by REP 103.
 """
 
+import reprlib
 from pathlib import Path
 from typing import Any
 
@@ -86,7 +87,7 @@ def _camera(document: dict[str, Any]) -> tuple[Camera, Float, Float]:
     # Some writers call it camera_model.
     model = document.get("distortion_model", document.get("camera_model", "plumb_bob"))
     if model not in MODELS:
-        raise ValueError(f"distortion_model {model!r} is not supported: {' or '.join(MODELS)}")
+        raise ValueError(f"distortion_model {reprlib.repr(model)} is not supported: {' or '.join(MODELS)}")
     size = int(document["image_width"]), int(document["image_height"])
     camera = camera_of(document["camera_matrix"]["data"], document["distortion_coefficients"]["data"], size)
     turn = rotation_of(document["rectification_matrix"]["data"], "rectification_matrix")

@@ -124,6 +124,11 @@ def test_a_configuration_is_checked(tmp_path: Path) -> None:
     assert "did you mean tracking.needle.max_diameter_mm?" in refused("config", "check", config)
 
 
+def test_nothing_is_repeated_as_published_where_nothing_was_published() -> None:
+    assert "no tracks were recorded with the pairs" in refused("replay", STEER, "--as-published")
+    assert "leave --paced" in refused("replay", STEER, "--as-published", "--paced")
+
+
 def test_calibrate_writes_the_rig_and_the_report(tmp_path: Path) -> None:
     folder = tmp_path / "bench 2"
     shutil.copytree(RECORDINGS / "calib-b", folder)

@@ -1,9 +1,9 @@
 """Tracking beside which a second process looks again, without haste.
 
 The needle is followed from pair to pair in the caller's thread, which takes milliseconds. Searches of whole images take
-ten times as long: a process of its own makes them meanwhile. What it finds is gone on from at the pair whose stamp says
-that it must be done by then, so that a replay, which makes the same searches in line, gives the same tracks. So no pair
-waits for a search but the first; only where one takes longer than usual the next pair waits a little for it.
+ten times as long: a process of its own makes them meanwhile. What it finds is gone on from at the next pair, and that
+pair's track says in which pair it was found: a replay that makes the same searches at the same pairs gives the same
+tracks, however busy the machine was. So no pair waits for a search but the first.
 """
 
 import copyreg
@@ -13,6 +13,8 @@ import multiprocessing
 import os
 import signal
 import time
+from collections.abc import Mapping
+from dataclasses import replace
 from multiprocessing.connection import Connection
 from multiprocessing.shared_memory import SharedMemory
 from types import MappingProxyType, TracebackType
@@ -20,6 +22,7 @@ from typing import Any, Self
 
 import cv2
 import numpy as np
+from threadpoolctl import threadpool_limits  # type: ignore[import-untyped]
 
 from needletrack.records import Frame, NeedleTrack, StereoPair
 from needletrack.rig import Rig
@@ -28,12 +31,9 @@ from needletrack.tracking.track import PAIRS_PER_AUDIT_OF_WEAK, adopted, audit, 
 
 _log = logging.getLogger(__name__)
 
-# An audit begins so many pairs after the one before at the soonest, and what it found is gone on from so long after its
-# pair, by the stamps: at 60 pairs a second, ten pairs after a track has slid it is noticed. A search for a needle that
-# is lost is done sooner. What is not done by then is waited for, but for half a pair at most: none is lost to it.
+# An audit begins so many pairs after the one before at the soonest: at 60 pairs a second it takes as long as four of
+# them, so that a track that has slid is noticed within ten.
 _PAIRS_PER_AUDIT = 5
-_AUDITED_AFTER_NS, _FOUND_AFTER_NS, _WAITED_FOR_S = 80_000_000, 45_000_000, 0.008
-_PAIRS_BEFORE_WAITING = 2
 # A needle that is lost is looked for where it was for so long, in case something only passed before it.
 _REMEMBERED_NS = 2_000_000_000
 _RESTART_AFTER_S, _STARTS_WITHIN_S, _ENDS_WITHIN_S = 5.0, 30.0, 1.0
@@ -48,10 +48,45 @@ def _read_only(values: dict[str, float]) -> MappingProxyType[str, float]:
 copyreg.pickle(MappingProxyType, lambda proxy: (_read_only, (dict(proxy),)))
 
 
+class _Follower:
+    """Follows a needle from pair to pair, and remembers where it was seen last."""
+
+    def __init__(self, rig: Rig, parameters: TrackingParameters) -> None:
+        self._rig, self._parameters = rig, parameters
+        self._seen: NeedleTrack | None = None
+
+    def begin(self, pair: StereoPair) -> NeedleTrack:
+        """The track of a pair without memory: searched."""
+        self._seen = None
+        return self._remembered(search(pair, self._rig, self._parameters))
+
+    def go_on(self, pair: StereoPair, previous: NeedleTrack, found: NeedleTrack | None) -> NeedleTrack:
+        """The track of a pair after `previous`; found: what a search has since made of a pair before."""
+        is_from_found = found is not None and found.curve is not None
+        if found is not None and is_from_found:
+            previous = found if previous.curve is None else adopted(previous, found)
+        track = self._followed(pair, previous)
+        if found is not None and is_from_found:
+            track = replace(track, searched_sequence=found.searched_sequence)
+        return self._remembered(track)
+
+    def _followed(self, pair: StereoPair, previous: NeedleTrack) -> NeedleTrack:
+        track, seen = follow(pair, self._rig, self._parameters, previous), self._seen
+        if track.curve is not None or seen is None or seen is previous:
+            return track
+        if not 0 <= pair.captured_at_ns - seen.captured_at_ns < _REMEMBERED_NS:
+            return track
+        again = follow(pair, self._rig, self._parameters, seen)
+        return again if again.curve is not None else track
+
+    def _remembered(self, track: NeedleTrack) -> NeedleTrack:
+        if track.curve is not None:
+            self._seen = track
+        return track
+
+
 class AuditedTracker:
     """Our method, one pair after another, of a rig; as a context audits and searches run beside it, else in line.
-
-    Either way the tracks are the same, as long as the second process keeps up.
 
     The first pair, and each that has no track before it, is searched here and now. after: the tracker in whose place
     this one comes; the thread that calls both closes it with the first pair given to this one, or `close` does.
@@ -62,10 +97,9 @@ class AuditedTracker:
         self._before = after
         self._auditor: _Auditor | None = None
         self._is_open, self._failed_at_s = False, 0.0
+        self._follower = _Follower(rig, parameters)
         self._since_audit = 0
-        self._good: NeedleTrack | None = None
         self._asked: tuple[StereoPair, NeedleTrack] | None = None
-        self._has_waited = False
         self.failures = 0
 
     def __enter__(self) -> Self:
@@ -112,50 +146,28 @@ class AuditedTracker:
         """The track of this pair; previous: that of the pair before, None to start without memory."""
         self._close_the_one_before()
         if previous is None:
-            self._good, self._asked, self._since_audit = None, None, 0
-            track = search(pair, self._rig, self._parameters)
+            self._asked, self._since_audit = None, 0
+            track = self._follower.begin(pair)
         else:
-            track = self._followed(pair, previous, self._found(pair.captured_at_ns))
-        if track.curve is not None:
-            self._good = track
+            track = self._follower.go_on(pair, previous, self._found())
         self._since_audit += 1
         self._look_again(pair, track)
         return track
 
-    def _followed(self, pair: StereoPair, previous: NeedleTrack, found: NeedleTrack | None) -> NeedleTrack:
-        if found is not None and found.curve is not None:
-            previous = found if previous.curve is None else adopted(previous, found)
-        track, good = follow(pair, self._rig, self._parameters, previous), self._good
-        if track.curve is not None or good is None or good is previous:
-            return track
-        if not 0 <= pair.captured_at_ns - good.captured_at_ns < _REMEMBERED_NS:
-            return track
-        again = follow(pair, self._rig, self._parameters, good)
-        return again if again.curve is not None else track
-
-    def _found(self, now_ns: int) -> NeedleTrack | None:
-        """What was found in the pair that was last looked at again, once, when it is time."""
+    def _found(self) -> NeedleTrack | None:
+        """What was found in the pair that was last looked at again, once, when it is there."""
         if self._asked is None:
             return None
-        pair, followed = self._asked
-        lasts_ns = _FOUND_AFTER_NS if followed.curve is None else _AUDITED_AFTER_NS
-        # A camera whose stamps leap backwards has begun anew.
-        if 0 <= now_ns - pair.captured_at_ns < lasts_ns:
-            return None
         if not self._is_open:
-            self._asked = None
-            return looked_again(pair, followed, self._rig, self._parameters)
-        if self._auditor is None:
-            self._asked = None
-            return None
-        try:
-            # Once, and not where pairs are lost already: a machine that is too busy must not lose more of them to it.
-            may_wait = not self._has_waited and self._since_audit >= _PAIRS_BEFORE_WAITING
-            found = self._auditor.found(_WAITED_FOR_S if may_wait else 0.0)
-        except (EOFError, OSError):
-            self._give_up()
-            return None
-        self._has_waited = found is None
+            found: NeedleTrack | None = looked_again(*self._asked, self._rig, self._parameters)
+        elif self._auditor is None:
+            found = None
+        else:
+            try:
+                found = self._auditor.found(0.0)
+            except (EOFError, OSError):
+                self._give_up()
+                return None
         if found is not None:
             self._asked = None
         return found
@@ -166,7 +178,7 @@ class AuditedTracker:
             return
         if self._is_open and not self._is_asked(pair, track):
             return
-        self._asked, self._since_audit, self._has_waited = (pair, track), 0, False
+        self._asked, self._since_audit = (pair, track), 0
 
     def _is_asked(self, pair: StereoPair, track: NeedleTrack) -> bool:
         if self._auditor is None:
@@ -187,6 +199,37 @@ class AuditedTracker:
         self._end()
 
 
+class RepeatedTracker:
+    """The tracks of a live run once more: its searches are made in line, and gone on from at the same pairs.
+
+    searched_in_ns: by stamp, for each pair whose track says so, the stamp of the pair that was searched for it; its own
+    where it was itself searched without memory.
+    """
+
+    def __init__(self, rig: Rig, parameters: TrackingParameters, searched_in_ns: Mapping[int, int]) -> None:
+        self._rig, self._parameters = rig, parameters
+        self._follower = _Follower(rig, parameters)
+        self._searched_in_ns = dict(searched_in_ns)
+        self._wanted_ns = frozenset(self._searched_in_ns.values())
+        self._kept: dict[int, tuple[StereoPair, NeedleTrack]] = {}
+
+    def __call__(self, pair: StereoPair, previous: NeedleTrack | None) -> NeedleTrack:
+        """The track of this pair; previous: that of the pair before, None to start without memory."""
+        now_ns = pair.captured_at_ns
+        searched_ns = self._searched_in_ns.get(now_ns)
+        if previous is None or searched_ns == now_ns:
+            track = self._follower.begin(pair)
+        else:
+            asked = None if searched_ns is None else self._kept.get(searched_ns)
+            # Searches are gone on from in the order in which they were asked for.
+            self._kept = {ns: kept for ns, kept in self._kept.items() if searched_ns is None or ns > searched_ns}
+            found = None if asked is None else looked_again(*asked, self._rig, self._parameters)
+            track = self._follower.go_on(pair, previous, found)
+        if now_ns in self._wanted_ns:
+            self._kept[now_ns] = (pair, track)
+        return track
+
+
 def looked_again(pair: StereoPair, followed: NeedleTrack, rig: Rig, parameters: TrackingParameters) -> NeedleTrack:
     """What a search makes of a pair to which a track was followed, or was not."""
     if followed.curve is None:
@@ -202,9 +245,6 @@ class _Auditor:
         self._shape = (2, height, width)
         self._memory = SharedMemory(create=True, size=2 * width * height)
         self._images: Any = np.ndarray(self._shape, np.uint8, self._memory.buf)
-        # One thread for BLAS and OpenMP, as everywhere: two that wait for one another take the tracking thread's core.
-        for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
-            os.environ.setdefault(variable, "1")
         context = multiprocessing.get_context("spawn")
         self._pipe, theirs = context.Pipe()
         self._process = context.Process(
@@ -272,6 +312,8 @@ def _audit_pairs(
     os.sched_setaffinity(0, range(os.cpu_count() or 1))
     os.nice(_NICE)
     cv2.setNumThreads(1)
+    # As in the process that follows: matrices as small as ours are slower with two, which wait for one another.
+    threadpool_limits(1)
     memory = SharedMemory(memory_name)
     images: Any = np.ndarray(shape, np.uint8, memory.buf)
     blank = Frame(np.zeros(shape[1:], np.uint8), 0)

@@ -141,11 +141,12 @@ def replay(
         ),
     ] = False,
     independent: Independent = False,
-    as_live: Annotated[
+    as_published: Annotated[
         bool,
         typer.Option(
-            "--as-live",
-            help="Go on from what a search finds as late as live, as --paced does: the tracks that were published.",
+            "--as-published",
+            help="The pairs that were tracked live, each from what it was tracked from live: the tracks that were "
+            "published while this was recorded, byte for byte but for times.",
         ),
     ] = False,
     start: Start = 0,
@@ -177,7 +178,7 @@ def replay(
             method=method,
             paced=paced,
             independent=independent,
-            as_live=as_live,
+            as_published=as_published,
             start=start,
             end=end,
             loop=loop,

@@ -322,7 +322,9 @@ class NeedleTrack:
     """The answer for one stereo pair, also when it is `invalid` (then curve, tip and base are None).
 
     since_detection counts the pairs that were tracked from the one before since the whole images were last searched;
-    doubts are those of the reasons that only such a search can find, or lift.
+    doubts are those of the reasons that only such a search can find, or lift. searched_sequence: of the pair whose
+    whole images were searched and from what was found there this track goes on: its own, or one a little before it;
+    None where the track before was followed alone.
 
     Raises ValueError where status and content contradict each other: an `ok` track has a curve and
     a tip and no reasons; a `degraded` one has a curve and reasons; an `invalid` one has no shape.
@@ -341,6 +343,7 @@ class NeedleTrack:
     timing_ms: Mapping[str, float] = field(default_factory=dict)
     evidence: Evidence = Evidence()
     doubts: tuple[Reason, ...] = ()
+    searched_sequence: int | None = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "timing_ms", MappingProxyType(dict(self.timing_ms)))

@@ -2,20 +2,22 @@
 
 import logging
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import ExitStack, suppress
 from datetime import UTC, datetime
 from pathlib import Path
 from threading import Event
 from typing import Literal
 
-from needletrack.auditing import AuditedTracker
+from needletrack.auditing import AuditedTracker, RepeatedTracker
 from needletrack.config import Config
+from needletrack.errors import RecordingError
 from needletrack.publish.message import RunContext, Source, TrackMessage
 from needletrack.publish.publisher import ZenohPublisher
 from needletrack.publish.tls import TlsFiles
 from needletrack.reading import text_of
 from needletrack.recording.asl import UnusablePair
+from needletrack.recording.mcap_file import McapRecording
 from needletrack.recording.replay import ReplaySource, StoredRecording
 from needletrack.recording.stored import open_stored
 from needletrack.recording.tracks import TrackFile
@@ -35,9 +37,10 @@ class Replay:
 
     method: our own, or the 2017 reference. paced: at the recorded pace, pairs are dropped where tracking is
     too slow; otherwise every pair is tracked, and two runs give the same bytes. independent: every pair
-    starts without memory. as_live: what an audit finds in a pair is gone on from as late as live, so that the tracks
-    are those that were published; otherwise at once, which is better. start, end, loop: as of ReplaySource. Raises
-    CalibrationError where the rig sees nothing of the workspace, RecordingError where there is nothing to play.
+    starts without memory. as_published: the pairs that were tracked live, each from what it was tracked from live, so
+    that the tracks are those that were published; otherwise what an audit finds in a pair is gone on from at once,
+    which is better. start, end, loop: as of ReplaySource. Raises CalibrationError where the rig sees nothing of the
+    workspace, RecordingError where there is nothing to play or no track was recorded to go by.
     """
 
     def __init__(
@@ -48,7 +51,7 @@ class Replay:
         method: Method = "curve",
         paced: bool = False,
         independent: bool = False,
-        as_live: bool = False,
+        as_published: bool = False,
         start: int = 0,
         end: int | None = None,
         loop: int = 1,
@@ -57,8 +60,18 @@ class Replay:
         rig.require_view_of(config.tracking.workspace)
         self.recording, self.config, self.method, self.independent = recording, config, method, independent
         self._start, self._paced = start, paced
-        self._tracker = _tracker(method, rig, config, as_live=paced or as_live)
-        self.source = ReplaySource(recording, paced=paced, start=start, end=end, loop=loop)
+        self._tracker = _tracker(method, rig, config, paced=paced)
+        tracked_ns: Mapping[int, int | None] | None = None
+        if as_published:
+            if paced or independent or method != "curve" or loop > 1:
+                raise RecordingError(
+                    "tracks are repeated as published once, by our own method, every pair from the one before: "
+                    "leave --paced, --independent, --loop and --method out"
+                )
+            tracked_ns = _published(recording)
+            searched_in_ns = {now: searched for now, searched in tracked_ns.items() if searched is not None}
+            self._tracker = RepeatedTracker(rig, config.tracking, searched_in_ns)
+        self.source = ReplaySource(recording, paced=paced, start=start, end=end, loop=loop, only_ns=tracked_ns)
         if warning := rig.age_warning(config.rig.max_age_days, datetime.now(UTC)):
             _log.warning("%s", warning)
         self.context = RunContext(
@@ -151,7 +164,22 @@ def _is_camchain(path: Path) -> bool:
     return False
 
 
-def _tracker(method: Method, rig: Rig, config: Config, *, as_live: bool) -> Tracker:
+def _published(recording: StoredRecording) -> dict[int, int | None]:
+    """By the stamp of each pair that was tracked: that of the pair that was searched for its track, None for none."""
+    told = recording.tracks() if isinstance(recording, McapRecording) else []
+    if not told:
+        raise RecordingError(
+            f"{recording.folder}: no tracks were recorded with the pairs: replay without --as-published"
+        )
+    messages = [TrackMessage.from_json(message) for _, message in told]
+    stamps_ns = {message.sequence: message.captured_at_ns for message in messages}
+    return {
+        message.captured_at_ns: None if message.searched_sequence is None else stamps_ns.get(message.searched_sequence)
+        for message in messages
+    }
+
+
+def _tracker(method: Method, rig: Rig, config: Config, *, paced: bool) -> Tracker:
     def by_reference(pair: StereoPair, previous: NeedleTrack | None) -> NeedleTrack:
         return track_reference(pair, rig)
 
@@ -160,4 +188,4 @@ def _tracker(method: Method, rig: Rig, config: Config, *, as_live: bool) -> Trac
 
     if method == "reference":
         return by_reference
-    return AuditedTracker(rig, config.tracking) if as_live else by_curve
+    return AuditedTracker(rig, config.tracking) if paced else by_curve

@@ -13,6 +13,8 @@ from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from typing import NamedTuple, Protocol
 
+from threadpoolctl import threadpool_limits  # type: ignore[import-untyped]
+
 from needletrack.calibration.drift import DriftParameters, DriftState, doubted
 from needletrack.capture.source import FrameSource
 from needletrack.publish.frames import in_published_frame
@@ -178,6 +180,12 @@ class Service:
 
     def run(self, sinks: Sequence[Sink], stop: threading.Event) -> RunSummary:
         """Track until the source ends or `stop` is set; the first exception of any thread ends the run, raised here."""
+        # What two threads of BLAS sum differs in the last digits from what one does: a track must not depend on how
+        # many processors there are. For matrices as small as ours two took twice the time of one.
+        with threadpool_limits(1, user_api="blas"):
+            return self._run(sinks, stop)
+
+    def _run(self, sinks: Sequence[Sink], stop: threading.Event) -> RunSummary:
         self._state = ServiceState.RUNNING
         started_s = time.monotonic()
         tracking_ms: deque[float] = deque(maxlen=_TIMES_KEPT)

@@ -39,7 +39,7 @@ from needletrack.publish.message import StatusMessage, TrackMessage
 from needletrack.recording.asl import AslRecording
 from needletrack.recording.mcap_file import McapRecording
 from needletrack.recording.registration import PointPairs, registered
-from needletrack.records import Clock, StampPlace, Status
+from needletrack.records import Clock, DropReason, StampPlace, Status
 from needletrack.replay import Replay, open_recording
 from needletrack.rig import CalibrationInfo, Rig, write_rig
 
@@ -230,46 +230,61 @@ def test_an_old_calibration_is_said_at_the_start_and_in_every_heartbeat(caplog: 
         assert status.calibration.warning == (said[0].getMessage() if is_old else None)
 
 
-def live_and_replayed(folder: Path, rig: Rig, count: int, monkeypatch: pytest.MonkeyPatch) -> list[TrackMessage]:
-    """So many pairs of steer-b tracked live, one after another; asserts that their replay gives the same bytes."""
+def live_and_replayed(folder: Path, rig: Rig, count: int, *, rate_hz: float | None = None) -> list[TrackMessage]:
+    """What is published of so many pairs of steer-b; asserts that their replay gives the same bytes.
+
+    They come one after another, each when the one before is done, or so often, however long tracking takes.
+    """
     recorded, cameras = AslRecording(STEER), two_cameras(rig.left.size_px)
     daemons: list[Daemon] = []
-    # However busy this machine is: what is not found in time is found later, and that is not the same.
-    monkeypatch.setattr("needletrack.auditing._WAITED_FOR_S", WAIT_S)
-    monkeypatch.setattr("needletrack.auditing._PAIRS_BEFORE_WAITING", 0)
 
-    def one_at_a_time(number: int) -> tuple[bytes, bytes] | None:
-        # A pair comes when the one before it is done, so that none is overwritten.
+    def shown(number: int) -> tuple[bytes, bytes] | None:
         service = daemons[0].service if daemons else None
-        if number == count or service is None or sum(service.statuses.values()) < number or service.busy_s:
+        if number == count or service is None:
             return None
-        pair = recorded.read(number)
+        if rate_hz is None and (sum(service.statuses.values()) < number or service.busy_s):
+            return None
+        # Forward and backward, so that the needle never jumps.
+        turns = number % (2 * len(recorded) - 2)
+        pair = recorded.read(min(turns, 2 * len(recorded) - 2 - turns))
         return pair.left.image.tobytes(), pair.right.image.tobytes()
 
     # Sooner than by default, which takes more pairs than are played here.
     config = config_for(rig, recording={"folder": folder}, drift={"least_pairs": 5})
-    with running(rig, config, RunningKernel(cameras, one_at_a_time)) as daemon:
+    with running(rig, config, RunningKernel(cameras, shown, rate_hz or 50.0)) as daemon:
         # Whoever hears heartbeats is connected, and will miss no track.
         daemon.status(lambda status: status.cameras is not None)
         daemons.append(daemon.daemon)
-        live = [daemon.next().message for _ in range(count)]
+        daemon.until(lambda received: received.message.sequence == count - 1)
         summary = daemon.stop()
-    assert summary.run.dropped == {}
     (file,) = folder.glob("*.mcap")
-    published = [told for _, told in McapRecording(file).tracks()]
-    assert published == [message.to_json() for message in live]
+    recording = McapRecording(file)
+    assert len(recording) == count
+    published = [told for _, told in recording.tracks()]
+    missed = count - len(published)
+    assert summary.run.dropped == ({DropReason.OVERWRITTEN: missed} if missed else {})
+    assert rate_hz is not None or not missed
     output = folder / "replayed.jsonl"
-    Replay(open_recording(file, config), config, as_live=True).run(threading.Event(), output=output)
+    Replay(open_recording(file, config), config, as_published=True).run(threading.Event(), output=output)
     replayed = output.read_bytes().splitlines()
     for ours, again in zip(published, replayed, strict=True):
         assert json.dumps(without_times(ours)).encode() == json.dumps(without_times(again)).encode()
-    return live
+    return [TrackMessage.from_json(message) for message in published]
 
 
-def test_recorded_live_and_replayed_give_the_same_bytes_in_the_robot_s_frame(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    live = live_and_replayed(tmp_path, registered_before_a_camera_was_turned(AslRecording(STEER).rig), 2, monkeypatch)
+@pytest.mark.slow
+def test_what_was_tracked_of_too_many_pairs_is_replayed_as_it_was(tmp_path: Path) -> None:
+    live = live_and_replayed(tmp_path, AslRecording(STEER).rig, 150, rate_hz=50.0)
+    # The first pair is searched while others come.
+    assert len(live) < 150
+    assert live[0].searched_sequence == live[0].sequence
+    gone_on_from = [message.searched_sequence for message in live[1:] if message.searched_sequence is not None]
+    assert gone_on_from
+    assert gone_on_from == sorted(set(gone_on_from))
+
+
+def test_recorded_live_and_replayed_give_the_same_bytes_in_the_robot_s_frame(tmp_path: Path) -> None:
+    live = live_and_replayed(tmp_path, registered_before_a_camera_was_turned(AslRecording(STEER).rig), 2)
     assert any(message.centerline_mm for message in live)
     assert {message.frame_id for message in live} == {"robot_base"}
     in_robot_mm = np.array([message.tip.position_mm for message in live if message.tip is not None])
@@ -280,13 +295,12 @@ def test_recorded_live_and_replayed_give_the_same_bytes_in_the_robot_s_frame(
 
 
 @pytest.mark.slow
-def test_what_is_told_of_a_turned_camera_live_is_told_by_its_replay(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    live = live_and_replayed(tmp_path, registered_before_a_camera_was_turned(AslRecording(STEER).rig), 15, monkeypatch)
+def test_what_is_told_of_a_turned_camera_live_is_told_by_its_replay(tmp_path: Path) -> None:
+    live = live_and_replayed(tmp_path, registered_before_a_camera_was_turned(AslRecording(STEER).rig), 45)
     # When it is told depends on how many tips were seen, and so on the pace at which this machine took the pairs.
     told = ["calibration_drift" in message.reasons for message in live]
     assert not any(told[:4])
+    assert told[-1]
     assert told == sorted(told)
     assert all(message.status is not Status.OK for message, is_told in zip(live, told, strict=True) if is_told)
 

@@ -160,6 +160,6 @@ def test_frames_to_tracks(tmp_path: Path) -> None:
         ):
             assert np.array_equal(ours.image, true.image)
     output = tmp_path / "replayed.jsonl"
-    Replay(open_recording(file, config), config, as_live=True).run(threading.Event(), output=output)
+    Replay(open_recording(file, config), config, as_published=True).run(threading.Event(), output=output)
     replayed = output.read_bytes().splitlines()
     assert [without_times(message) for message in replayed] == [without_times(message) for message in published]

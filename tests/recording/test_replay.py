@@ -51,6 +51,15 @@ def test_the_recorded_pairs_come_unchanged_and_in_order(recording: AslRecording)
     assert (len(source), source.dropped) == (4, {})
 
 
+def test_of_some_pairs_the_others_are_counted(recording: AslRecording) -> None:
+    source = ReplaySource(recording, only_ns={LEFT_NS[1], LEFT_NS[3]})
+    dropped = []
+    for pair in source.pairs(threading.Event()):
+        assert pair.captured_at_ns == LEFT_NS[pair.sequence]
+        dropped.append((pair.sequence, source.dropped))
+    assert dropped == [(1, {DropReason.OVERWRITTEN: 1}), (3, {DropReason.OVERWRITTEN: 2})]
+
+
 @pytest.mark.parametrize(
     ("start", "end", "indices"),
     [(0, None, [0, 1, 2, 3]), (1, None, [1, 2, 3]), (0, 2, [0, 1]), (1, 3, [1, 2]), (2, 99, [2, 3])],

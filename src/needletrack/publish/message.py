@@ -233,6 +233,11 @@ class TrackMessage(WirePart):
     tip: WireTip | None = Field(description="the free end; never null when ok")
     base: WireBase | None = Field(description="where the needle leaves its sleeve or the image; null if unknown")
     quality: WireQuality = Field(description="how well the shape explains the images")
+    searched_sequence: Count | None = Field(
+        default=None,
+        description="of the pair whose whole images were searched and from whose result this track goes on: its own, "
+        "or one a little before it; null where it follows the track before alone",
+    )
     timing_ms: Mapping[str, float] | None = Field(
         description="part of the latency, or stage of tracking: milliseconds (docs/latency.md); null in a "
         "deterministic replay"
@@ -291,6 +296,7 @@ class TrackMessage(WirePart):
             tip=None if track.tip is None else WireTip.from_pose(track.tip),
             base=None if track.base is None else WireBase.from_pose(track.base),
             quality=WireQuality.from_quality(track.quality, pair),
+            searched_sequence=track.searched_sequence,
             timing_ms=None
             if run.deterministic
             else {stage: round(ms, MS_DIGITS) for stage, ms in {**(parts_ms or {}), **track.timing_ms}.items()},

@@ -2,7 +2,7 @@
 
 import logging
 import time
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -69,7 +69,8 @@ class ReplaySource:
 
     paced: each pair is released when the recorded interval since the first has passed, and says when that
     was; a late consumer gets every pair, without waiting, until it has caught up. Otherwise pairs come as
-    fast as they are taken. Raises RecordingError where the range is empty, or a loop has but one pair.
+    fast as they are taken. only_ns: the stamps of the pairs to be played, None for all; the others are counted as
+    overwritten. Raises RecordingError where the range is empty, or a loop has but one pair.
     """
 
     def __init__(
@@ -80,8 +81,9 @@ class ReplaySource:
         start: int = 0,
         end: int | None = None,
         loop: int = 1,
+        only_ns: Container[int] | None = None,
     ) -> None:
-        self._recording = recording
+        self._recording, self._only_ns = recording, only_ns
         self._paced = paced
         self._range = range(start, len(recording) if end is None else min(end, len(recording)))
         self._loop = loop
@@ -121,6 +123,9 @@ class ReplaySource:
                     self._count(pair.losses)
                     if step.sequence == step.index:
                         _log.warning("pair %d is left out: %s", step.index, pair)
+                    continue
+                if self._only_ns is not None and step.stamp_ns not in self._only_ns:
+                    self._dropped[DropReason.OVERWRITTEN] = self._dropped.get(DropReason.OVERWRITTEN, 0) + 1
                     continue
                 yield _as_played(pair, step, now_ns if self._paced else None)
 

@@ -115,9 +115,12 @@ def search(
         if _may_go_on(shape, candidates, rig):
             shape = shape.doubted([Reason.TIP_NOT_SEEN])
     except NeedleNotFound as lost:
-        return NeedleTrack(pair.captured_at_ns, Status.INVALID, (Reason(lost.reason),), timing_ms=stopwatch.elapsed_ms)
-    evidence = Evidence() if found is None else Evidence(found.left, found.right, found.correspondences)
-    return as_track(shape, pair.captured_at_ns, previous, 0, evidence, stopwatch.elapsed_ms)
+        lost_for = (Reason(lost.reason),)
+        track = NeedleTrack(pair.captured_at_ns, Status.INVALID, lost_for, timing_ms=stopwatch.elapsed_ms)
+    else:
+        evidence = Evidence() if found is None else Evidence(found.left, found.right, found.correspondences)
+        track = as_track(shape, pair.captured_at_ns, previous, 0, evidence, stopwatch.elapsed_ms)
+    return replace(track, searched_sequence=pair.sequence)
 
 
 def audit(pair: StereoPair, rig: StereoRig, parameters: TrackingParameters, followed: NeedleTrack) -> NeedleTrack:
@@ -153,12 +156,13 @@ def audit(pair: StereoPair, rig: StereoRig, parameters: TrackingParameters, foll
     try:
         shape, _ = _best(rivals, own, images, rig, parameters, None, stopwatch)
     except NeedleNotFound:
-        return with_doubts(followed, (Reason.AMBIGUOUS_SHAPE,))
+        return replace(with_doubts(followed, (Reason.AMBIGUOUS_SHAPE,)), searched_sequence=pair.sequence)
     if not any(_is_of(candidate, shape.curve.points_mm, rig) for candidate in candidates):
         shape = shape.doubted([Reason.AMBIGUOUS_SHAPE])
     elif _may_go_on(shape, candidates, rig):
         shape = shape.doubted([Reason.TIP_NOT_SEEN])
     track = as_track(shape, pair.captured_at_ns, None, 0, Evidence(), stopwatch.elapsed_ms)
+    track = replace(track, searched_sequence=pair.sequence)
     if track.tip is None or followed.tip is None or _differ(track, followed):
         return track
     return replace(track, tip=replace(track.tip, velocity_mm_s=followed.tip.velocity_mm_s))

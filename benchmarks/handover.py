@@ -14,7 +14,6 @@ from benchmarks.worlds import Sequence
 from needletrack.auditing import AuditedTracker
 from needletrack.client import Subscriber
 from needletrack.daemon.process import settle_memory
-from needletrack.daemon.run import warm_up
 from needletrack.errors import PublishError
 from needletrack.publish.message import TrackMessage
 from needletrack.publish.publisher import ZenohPublisher
@@ -48,7 +47,7 @@ def measure_handover(sequence: Sequence, plan: Plan, done: Callable[[], None]) -
         with ZenohPublisher(run, service.status, listen=[endpoint]) as publisher:
             if not publisher.wait_for_subscriber(START_S):
                 raise PublishError(f"the subscriber's process did not connect to {endpoint} in {START_S:g} s")
-            warm_up(tracker, rig)
+            tracker.warm_up()
             tracker(sequence.pairs[0], None)
             settle_memory()
             summary = service.run([Published(publisher), _Progress(done)], threading.Event())

@@ -24,7 +24,7 @@ from benchmarks.threads import one_thread
 from needletrack.auditing import AuditedTracker
 from needletrack.config import load_config
 from needletrack.daemon.process import settle_memory
-from needletrack.daemon.run import RecordedSource, warm_up
+from needletrack.daemon.run import RecordedSource
 from needletrack.publish.message import RunContext, Source, TrackMessage, WireRecording
 from needletrack.publish.publisher import ZenohPublisher
 from needletrack.recording.mcap_file import About
@@ -175,7 +175,7 @@ def under_load(recording: Path, rate_hz: float, seconds: float, *, record: Path 
         report = folder / "received.json"
         watching = _subscriber(rig.name, endpoint, report)
         if audited is not None:
-            warm_up(audited, rig)
+            audited.warm_up()
             audited(pairs[0], None)
         settle_memory()
         assert publisher.wait_for_subscriber(_SUBSCRIBED_WITHIN_S)

@@ -19,7 +19,6 @@ from benchmarks.worker import run_of
 from benchmarks.worlds import Playing, Sequence
 from needletrack.auditing import AuditedTracker
 from needletrack.daemon.process import settle_memory
-from needletrack.daemon.run import warm_up
 from needletrack.errors import PublishError
 from needletrack.publish.message import TrackMessage
 from needletrack.publish.publisher import ZenohPublisher
@@ -104,7 +103,7 @@ def replay(frames: Path, rig: Rig, rate_hz: float, pairs: int, samples: int, end
             with ZenohPublisher(run, service.status, listen=[endpoint]) as publisher:
                 if not publisher.wait_for_subscriber(START_S):
                     raise PublishError(f"the subscriber's process did not connect to {endpoint} in {START_S:g} s")
-                warm_up(tracker, rig)
+                tracker.warm_up()
                 settle_memory()
                 started_mb = psutil.Process().memory_info().rss / 1e6
                 summary = service.run([Published(publisher), sink], stop)

@@ -61,7 +61,6 @@ def start(frames: Path, rig_file: Path) -> dict[str, int]:
     from needletrack.config import load_config
     from needletrack.daemon.metrics import Metrics
     from needletrack.daemon.process import settle_memory
-    from needletrack.daemon.run import warm_up
     from needletrack.publish.message import RunContext, Source
     from needletrack.publish.publisher import ZenohPublisher
     from needletrack.rig import read_rig
@@ -77,7 +76,7 @@ def start(frames: Path, rig_file: Path) -> dict[str, int]:
         publisher = opened.enter_context(ZenohPublisher(run, service.status, listen=["tcp/127.0.0.1:0"]))
         opened.enter_context(Metrics(service, Surroundings, 0))
         moments["built"] = time.monotonic_ns()
-        warm_up(tracker, rig)
+        tracker.warm_up()
         settle_memory()
         moments["warm"] = time.monotonic_ns()
         first = _First(publisher)

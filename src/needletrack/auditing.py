@@ -27,7 +27,7 @@ from threadpoolctl import threadpool_limits  # type: ignore[import-untyped]
 from needletrack.records import Frame, NeedleTrack, StereoPair
 from needletrack.rig import Rig
 from needletrack.tracking.parameters import TrackingParameters
-from needletrack.tracking.track import PAIRS_PER_AUDIT_OF_WEAK, adopted, audit, follow, search
+from needletrack.tracking.track import PAIRS_PER_AUDIT_OF_WEAK, adopted, audit, follow, search, warm_up
 
 _log = logging.getLogger(__name__)
 
@@ -96,7 +96,7 @@ class AuditedTracker:
         self._rig, self._parameters = rig, parameters
         self._before = after
         self._auditor: _Auditor | None = None
-        self._is_open, self._failed_at_s = False, 0.0
+        self._is_open, self._is_warm, self._failed_at_s = False, False, 0.0
         self._follower = _Follower(rig, parameters)
         self._since_audit = 0
         self._asked: tuple[StereoPair, NeedleTrack] | None = None
@@ -133,7 +133,13 @@ class AuditedTracker:
         return None if self._auditor is None else self._auditor.pid
 
     def warm_up(self, within_s: float = _STARTS_WITHIN_S) -> bool:
-        """Wait until the second process is there; whether it is, or there is none to wait for."""
+        """Make ready what the first pair needs, and wait until the second process is there.
+
+        Whether it is, or there is none to wait for.
+        """
+        if not self._is_warm:
+            warm_up(self._rig, self._parameters)
+            self._is_warm = True
         if self._auditor is None:
             return True
         try:
@@ -316,8 +322,7 @@ def _audit_pairs(
     threadpool_limits(1)
     memory = SharedMemory(memory_name)
     images: Any = np.ndarray(shape, np.uint8, memory.buf)
-    blank = Frame(np.zeros(shape[1:], np.uint8), 0)
-    search(StereoPair(blank, blank, 0), rig, parameters)
+    warm_up(rig, parameters)
     pipe.send(None)
     while True:
         try:

@@ -6,6 +6,7 @@ from functools import cache
 import numpy as np
 import numpy.typing as npt
 import pytest
+from scipy.spatial import KDTree
 from tests.tracking.scenes import ARC, BEHIND, MIDDLE_MM, RIG, SIZE_PX, WORLDS, Scene, scene, seen_at, tracked
 
 from needletrack.geometry import spline
@@ -19,7 +20,7 @@ from needletrack.synthetic.rig import default_rig
 from needletrack.synthetic.world import DARK_ON_LIGHT, LIGHT_ON_DARK, STEEL, Lighting, Rod, World
 from needletrack.tracking.needle import EntrySide
 from needletrack.tracking.parameters import TrackingParameters
-from needletrack.tracking.track import PAIRS_PER_AUDIT, PAIRS_PER_AUDIT_OF_WEAK, track, track_pair
+from needletrack.tracking.track import PAIRS_PER_AUDIT, PAIRS_PER_AUDIT_OF_WEAK, audit, follow, track, track_pair
 
 
 def scored(name: str) -> Score:
@@ -649,3 +650,32 @@ def test_a_tip_that_leaps_between_two_pairs_is_found_where_it_is(by_mm: float) -
     assert found.status is Status.OK, found.reasons
     assert result.tip_mm is not None
     assert result.tip_mm < TIP_MM
+
+
+def faded(name: str, from_mm: float, gap_mm: float, shown_share: float) -> StereoPair:
+    """A scene whose needle is gone for a stretch of its arc, and beyond it shown with a share of its contrast."""
+    shown, empty = scene(name), seen_at(replace(WORLDS[name], needle=None))
+    arc = spline.arc_length(shown.truth.centerline_mm)
+    share = np.where(arc < from_mm, 1.0, np.where(arc < from_mm + gap_mm, 0.0, shown_share))
+    frames = []
+    for px, image, without in zip(RIG.project(shown.truth.centerline_mm), shown.images, empty.images, strict=True):
+        rows, columns = np.indices(image.shape)
+        nearest = KDTree(px).query(np.column_stack([columns.ravel(), rows.ravel()]))[1].reshape(image.shape)
+        both = without + share[nearest] * (image.astype(np.float64) - without)
+        frames.append(Frame(np.clip(np.rint(both), 0, 255).astype(np.uint8), 0))
+    return StereoPair(frames[0], frames[1], 0)
+
+
+@pytest.mark.parametrize("name", ["dark", "light"])
+@pytest.mark.parametrize("share", [0.08, 0.15])
+def test_a_needle_that_fades_does_not_end_where_it_fades(name: str, share: float) -> None:
+    arc = spline.arc_length(scene(name).truth.centerline_mm)
+    pair = faded(name, float(arc[-1]) - 25.0, 2.0, share)
+    track = track_pair(pair, RIG)
+    tip_mm = scene(name).truth.tip_mm
+    assert track.tip is None or np.linalg.norm(track.tip.position_mm - tip_mm) < 0.5
+    # And what is followed is told so by its audit.
+    followed = follow(pair, RIG, TrackingParameters(), tracked(name))
+    if followed.curve is not None:
+        audited = audit(pair, RIG, TrackingParameters(), followed)
+        assert audited.tip is None or np.linalg.norm(audited.tip.position_mm - tip_mm) < 0.5

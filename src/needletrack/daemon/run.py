@@ -9,8 +9,6 @@ from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from enum import IntEnum
 
-import numpy as np
-
 from needletrack.auditing import AuditedTracker
 from needletrack.capture.kernel import Kernel
 from needletrack.capture.live import LiveSource
@@ -33,7 +31,7 @@ from needletrack.publish.session import open_endpoints
 from needletrack.publish.tls import TlsFiles
 from needletrack.recording.mcap_file import About
 from needletrack.recording.recorder import Recorder, RecorderSettings
-from needletrack.records import DropReason, Frame, NeedleTrack, StereoPair
+from needletrack.records import DropReason, NeedleTrack, StereoPair
 from needletrack.rig import Rig
 from needletrack.service import RunSummary, Service, Sink, Surroundings
 
@@ -155,7 +153,7 @@ class Daemon:
             metrics = opened.enter_context(Metrics(service, self.surroundings, config.daemon.metrics_port))
             if config.daemon.lock_memory:
                 lock_memory()
-            warm_up(tracker, rig)
+            tracker.warm_up()
             settle_memory()
             opened.enter_context(_Pulse(notifier, service, self._cameras))
             opened.enter_context(desk)
@@ -306,14 +304,6 @@ class _Pulse:
             elif not told:
                 _log.error("stuck: capture for %.1f s, tracking for %.1f s", silent_s, self._service.busy_s)
                 told = True
-
-
-def warm_up(tracker: AuditedTracker, rig: Rig) -> None:
-    """Track an empty pair, for nothing: the first call of every library takes a multiple of the next."""
-    width, height = rig.left.size_px
-    empty = Frame(np.zeros((height, width), np.uint8), 0)
-    tracker(StereoPair(empty, empty, 0), None)
-    tracker.warm_up()
 
 
 def require_fit(rig: Rig, config: Config) -> None:

@@ -31,6 +31,61 @@ EXPORT void products(const double *sections, int64_t n, int64_t count, const dou
   }
 }
 
+/* The weights (n, f) of `products` in the log evidence of n covariances (n, count, count) of what is seen but for the
+   noise: -1/2 x' C^-1 x - 1/2 log det C of sections x whitened by `whitener`. Symmetric matrices; by Cholesky. */
+EXPORT void evidence_weights(const double *covariances, int64_t n, int64_t count, const double *whitener, float *out) {
+  double white[MOST_SAMPLES * MOST_SAMPLES], half[MOST_SAMPLES * MOST_SAMPLES], inverse[MOST_SAMPLES * MOST_SAMPLES];
+  for (int64_t each = 0; each < n; each++) {
+    const double *seen = covariances + each * count * count;
+    /* half = whitener (C + 1), white = the lower triangle of half whitener. */
+    for (int64_t i = 0; i < count; i++) {
+      double *row = half + i * count;
+      for (int64_t j = 0; j < count; j++) row[j] = whitener[i * count + j];
+      for (int64_t k = 0; k < count; k++) {
+        double factor = whitener[i * count + k];
+        for (int64_t j = 0; j < count; j++) row[j] += factor * seen[k * count + j];
+      }
+    }
+    for (int64_t i = 0; i < count; i++)
+      for (int64_t j = 0; j <= i; j++) {
+        double sum = 0;
+        for (int64_t k = 0; k < count; k++) sum += half[i * count + k] * whitener[j * count + k];
+        white[i * count + j] = sum;
+      }
+    double log_determinant = 0;
+    for (int64_t i = 0; i < count; i++)
+      for (int64_t j = 0; j <= i; j++) {
+        double sum = white[i * count + j];
+        for (int64_t k = 0; k < j; k++) sum -= white[i * count + k] * white[j * count + k];
+        white[i * count + j] = i == j ? sqrt(sum) : sum / white[j * count + j];
+      }
+    for (int64_t i = 0; i < count; i++) log_determinant += log(white[i * count + i]);
+    /* half = the inverse of the root, row by row; inverse = half' half, its upper triangle. */
+    for (int64_t i = 0; i < count; i++) {
+      double *row = half + i * count, scale = 1 / white[i * count + i];
+      for (int64_t j = 0; j < count; j++) row[j] = i == j;
+      for (int64_t k = 0; k < i; k++) {
+        double factor = white[i * count + k];
+        for (int64_t j = 0; j <= k; j++) row[j] -= factor * half[k * count + j];
+      }
+      for (int64_t j = 0; j <= i; j++) row[j] *= scale;
+    }
+    memset(inverse, 0, sizeof(double) * (size_t)(count * count));
+    for (int64_t k = 0; k < count; k++)
+      for (int64_t i = 0; i <= k; i++) {
+        double factor = half[k * count + i];
+        for (int64_t j = i; j <= k; j++) inverse[i * count + j] += factor * half[k * count + j];
+      }
+    float *row = out + each * (count * (count + 1) / 2 + 1);
+    for (int64_t i = 0; i < count; i++) {
+      row[0] = (float)(-0.5 * inverse[i * count + i]);
+      for (int64_t j = i + 1; j < count; j++) row[j - i] = (float)-inverse[i * count + j];
+      row += count - i;
+    }
+    *row = (float)-log_determinant;
+  }
+}
+
 /* Log evidence (n, s) of one or the other of two (n, s) each that lie in one array, row by row; see `either`. */
 EXPORT void either_of_both(const float *both, int64_t n, int64_t s, float *out) {
   for (int64_t i = 0; i < n; i++) {

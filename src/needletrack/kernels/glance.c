@@ -231,10 +231,10 @@ static void tapered(const Glance *g, const double *before_tip, int64_t n, int64_
     double share = before / (g->taper_mm > 1e-6 ? g->taper_mm : 1e-6), here = thickest * (share < 1 ? share : 1);
     width[i] = -1;
     if (here < thinnest) continue;
-    /* Every bank is as large as a cache: a few of them will do. */
-    int64_t thinner = g->half_width - (int64_t)rint(log(here / thinnest) / grows);
-    thinner = (int64_t)rint((double)thinner / (double)g->width_step) * g->width_step;
-    width[i] = thinner < g->half_width ? g->half_width - thinner : 0;
+    /* Every bank is as large as a cache: a few of them will do, and the same ones for every thickness. */
+    int64_t as_thick = (int64_t)rint(log(here / thinnest) / grows), step = g->width_step;
+    int64_t nearest = (as_thick + step / 2) / step * step;
+    width[i] = 2 * (g->half_width - as_thick) < step || nearest >= g->half_width ? g->half_width : nearest;
   }
 }
 

@@ -16,6 +16,8 @@ from needletrack.tracking.needle import Positive
 from needletrack.tracking.profile import EDGE_SPREAD_PX, FLANK_PX, find_line, flanks
 
 _ACROSS_STEP_PX = 0.5
+# A line beyond the needle's end is looked for within so much of the curve, and its flanks so far from its edges.
+_LINE_OFF_PX, _FLANK_FROM_PX, _FLANK_TO_PX = 1.5, 1.5, 4.0
 
 
 class BesideParameters(BaseModel):
@@ -25,6 +27,9 @@ class BesideParameters(BaseModel):
 
     search_px: Positive = Field(2.0, description="A line is looked for this far to either side of the curve, px.")
     line_height_gray: Positive = Field(8.0, description="It stands out from both its sides by so many grey levels.")
+    faint_line_gray: Positive = Field(
+        2.5, description="Beyond the tip a line stands out by so many grey levels in both views: it is not the tip."
+    )
     max_width_share: Positive = Field(1.25, description="It is at most this share of the needle's width.")
     smooth_along_mm: Positive = Field(0.5, description="Sigma of the averaging along the curve, mm.")
 
@@ -64,3 +69,28 @@ def look_beside(
     line = find_line(strip, offsets, middle_px, parameters.search_px, parameters.line_height_gray)
     fits = line.found & (line.width_px < parameters.max_width_share * width_px + 0.5)
     return Beside(flanks(strip, offsets, middle_px), np.where(fits, line.height_gray * line.width_px, 0.0))
+
+
+def line_height_gray(image: Image, camera: Camera, points_mm: Float, diameter_mm: float) -> float:
+    """By how many grey levels a line as wide as the needle stands out along a curve (N, 3) from both its sides.
+
+    The curve is given in this camera's frame. Negative where it is darker; 0 where one side is brighter and one darker,
+    as at an edge. The curve's mean profile counts, so that a line that is fainter than the noise is seen.
+    """
+    center = camera.project(points_mm)
+    along = tangents(center)
+    normal = np.column_stack([-along[:, 1], along[:, 0]])
+    half_px = diameter_mm * camera.focal_px / float(np.median(points_mm[:, 2])) / 2
+    steps = np.ceil((half_px + _FLANK_TO_PX + _LINE_OFF_PX) / _ACROSS_STEP_PX)
+    offsets = np.arange(-steps, steps + 1) * _ACROSS_STEP_PX
+    x, y = ((center[:, None, k] + offsets * normal[:, None, k]).astype(np.float32) for k in (0, 1))
+    profile = cv2.remap(image.astype(np.float32), x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE).mean(axis=0)
+    most = 0.0
+    for off in np.arange(-_LINE_OFF_PX, _LINE_OFF_PX + 1e-6, _ACROSS_STEP_PX):
+        at = offsets - off
+        beside = (np.abs(at) >= half_px + _FLANK_FROM_PX) & (np.abs(at) <= half_px + _FLANK_TO_PX)
+        middle = float(profile[np.abs(at) <= half_px].mean())
+        over = middle - np.array([profile[beside & (at < 0)].mean(), profile[beside & (at > 0)].mean()])
+        height = float(np.sign(over[0]) * np.abs(over).min()) if over[0] * over[1] > 0 else 0.0
+        most = height if abs(height) > abs(most) else most
+    return most

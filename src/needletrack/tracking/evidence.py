@@ -129,6 +129,10 @@ def over_none(by_background: Float32, none: Float) -> tuple[Float, Mask]:
 
 
 _PAIRS = np.triu_indices(len(OFFSETS))
+# Where the product of two samples is that of their mirror images.
+_PLACE = np.zeros((len(OFFSETS), len(OFFSETS)), np.int64)
+_PLACE[_PAIRS] = np.arange(len(_PAIRS[0]))
+_MIRRORED = np.append(_PLACE[::-1, ::-1].T[_PAIRS], len(_PAIRS[0]))
 
 
 @lru_cache(maxsize=1)
@@ -139,8 +143,13 @@ def reference() -> Float:
     return np.asarray((vectors / np.sqrt(values)) @ vectors.T)
 
 
-@lru_cache(maxsize=1024)
+@lru_cache(maxsize=512)
 def bank(half_width: float, blur: float, inside: int, grid: Grid) -> Float32:
+    """The same bank as that of `new_bank`, kept: it takes a millisecond to make."""
+    return new_bank(half_width, blur, inside, grid)
+
+
+def new_bank(half_width: float, blur: float, inside: int, grid: Grid) -> Float32:
     """The hypotheses of one half width at every shift of the grid; of 0: of background alone, without shifts.
 
     They are the weights (F, kinds * shifts) of `products` in their log evidence.
@@ -150,42 +159,35 @@ def bank(half_width: float, blur: float, inside: int, grid: Grid) -> Float32:
     longer = np.arange(-extra, n) * ACROSS_STEP - REACH
     rests = np.arange(grid.substeps)[:, None] * (ACROSS_STEP / grid.substeps)
     seen = _covariances(longer - rests, half_width, blur, inside)
-    wholes, rest = np.divmod(np.arange(grid.reach + 1), grid.substeps)
-    index = extra - wholes[:, None] + np.arange(n)
-    forms, log_determinants = _forms(
-        seen[rest[:, None, None], :, index[:, :, None], index[:, None]].transpose(0, 3, 1, 2)
-    )
+    covariances = np.empty((seen.shape[1], grid.reach + 1, n, n))
+    for shift in range(grid.reach + 1):
+        whole, rest = divmod(shift, grid.substeps)
+        covariances[:, shift] = seen[rest, :, extra - whole : extra - whole + n, extra - whole : extra - whole + n]
+    weights = _weights(covariances)
     # Shifts the other way are the mirror images.
-    return _as_bank(
-        np.concatenate([forms[:0:-1, :, ::-1, ::-1], forms]),
-        np.concatenate([log_determinants[:0:-1], log_determinants]),
-    )
+    return _as_bank(np.concatenate([weights[:, :0:-1, _MIRRORED], weights], axis=1))
 
 
 @lru_cache(maxsize=64)
 def no_needle_bank(blur: float) -> Float32:
     """Background alone, then a single edge at every sample but the outermost ones."""
-    edge = _as_bank(*_forms(_covariances(OFFSETS - OFFSETS[2:-2, None], _EDGE_HALF_WIDTH, blur, 0)))
-    return np.hstack([bank(0.0, blur, 0, _HERE), edge])
+    edges = _covariances(OFFSETS - OFFSETS[2:-2, None], _EDGE_HALF_WIDTH, blur, 0).swapaxes(0, 1)
+    return np.hstack([bank(0.0, blur, 0, _HERE), _as_bank(_weights(edges))])
 
 
-def _as_bank(forms: Float, log_determinants: Float) -> Float32:
-    first, second = _PAIRS
-    weights = forms[..., first, second] * np.where(first == second, -0.5, -1.0)
-    both = np.concatenate([weights, -log_determinants[..., None]], axis=2).swapaxes(0, 1)
-    return np.ascontiguousarray(both.reshape(-1, len(first) + 1).T, dtype=np.float32)
+def _as_bank(weights: Float32) -> Float32:
+    """Weights (kinds, shifts, F) as columns (F, kinds * shifts)."""
+    return np.ascontiguousarray(weights.reshape(-1, weights.shape[-1]).T)
 
 
-def _forms(covariances: Float) -> tuple[Float, Float]:
-    """Quadratic forms (shifts, kinds, n, n) of misfits in sections whitened by `reference`; log determinants.
-
-    covariances (shifts, kinds, n, n): of what is seen but for the noise.
-    """
-    whitener = reference()
-    white = whitener @ (covariances + np.eye(covariances.shape[-1])) @ whitener
-    log_determinants = np.log(np.diagonal(np.linalg.cholesky(white), axis1=2, axis2=3)).sum(axis=2)
-    log_determinants -= np.linalg.slogdet(whitener)[1]
-    return np.asarray(np.linalg.inv(white), dtype=np.float64), log_determinants
+def _weights(covariances: Float) -> Float32:
+    """The weights (..., F) of `products` in log evidence; covariances (..., n, n) are of what is seen but for noise."""
+    contiguous = np.ascontiguousarray(covariances)
+    n = contiguous.shape[-1]
+    weights = np.empty((*contiguous.shape[:-2], len(_PAIRS[0]) + 1), np.float32)
+    call("evidence_weights", contiguous, contiguous.size // n**2, n, reference(), weights)
+    weights[..., -1] += np.linalg.slogdet(reference())[1]
+    return weights
 
 
 def _covariances(samples: Float, half_width: float, blur: float, inside: int) -> Float:

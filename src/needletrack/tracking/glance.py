@@ -28,7 +28,7 @@ from needletrack.tracking.ends import (
     TIP_BEYOND_MM,
     EndsParameters,
 )
-from needletrack.tracking.evidence import BLURS, HALF_WIDTHS, LIVELY, OFFSETS, bank, no_needle_bank, reference
+from needletrack.tracking.evidence import BLURS, HALF_WIDTHS, LIVELY, OFFSETS, Grid, new_bank, no_needle_bank, reference
 from needletrack.tracking.fit import ROBUST_SIGMAS, ROUNDS, CurveFit, FitParameters, priors
 from needletrack.tracking.needle import Needle
 from needletrack.tracking.profile import EDGE_SPREAD_PX, FLANK_PX, Mask
@@ -361,15 +361,21 @@ def _panels(weights: Array) -> Array:
     return np.ascontiguousarray(padded.reshape(rows, -1, 16).swapaxes(0, 1))
 
 
-@lru_cache(maxsize=4)
+@lru_cache(maxsize=64)
+def _bank(half_width: int, blur: int, inside: int, grid: Grid) -> Array:
+    """A bank by the indices of its half width, blur and inside."""
+    return _panels(new_bank(float(HALF_WIDTHS[half_width]), BLURS[blur], inside, grid))
+
+
+@lru_cache(maxsize=16)
 def _wanted(parameters: GlanceParameters, appearance: Appearance) -> tuple[_Glance, tuple[Array, ...]]:
     """What does not change from pair to pair; and the arrays that it points to."""
     needle, fit, looks = parameters.needle, parameters.fit, MOVED
     grid, blur = looks.grid, BLURS[appearance.blur]
     banks = np.zeros(len(HALF_WIDTHS), np.uintp)
     kept: list[Array] = [banks]
-    for width in {0, *range(appearance.half_width, -1, -_WIDTH_STEP)}:
-        each = _panels(bank(float(HALF_WIDTHS[width]), blur, appearance.inside, grid))
+    for width in {*range(0, appearance.half_width, _WIDTH_STEP), appearance.half_width}:
+        each = _bank(width, appearance.blur, appearance.inside, grid)
         banks[width] = address(each)
         kept.append(each)
     prior, log_prior = prior_of_parts()

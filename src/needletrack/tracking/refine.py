@@ -17,7 +17,7 @@ from needletrack.geometry.stereo import StereoRig
 from needletrack.geometry.transform import RigidTransform
 from needletrack.records import Appearance, Float, NeedleTrack, Reason
 from needletrack.tracking.adjust import GROWING, MOVED, ROUGH, SETTLED, Adjusted, Images, adjust
-from needletrack.tracking.beside import Beside, BesideParameters, look_beside
+from needletrack.tracking.beside import Beside, BesideParameters, line_height_gray, look_beside
 from needletrack.tracking.ends import (
     TIP_BEFORE_MM,
     TIP_BEYOND_MM,
@@ -62,6 +62,8 @@ WIDTH_ALLOWANCE = 1.4
 _MOST_ODDS = 30.0
 # And once more where it was not within this of the end of the curve.
 _TIP_MOVED_MM = 0.3
+# Where a line is looked for beyond the tip: its blur, and the error of a tip that was found, end before.
+_BEYOND_MM, _BEYOND_STEP_MM = (1.5, 6.5), 0.5
 # Less than so much that looks like more of a needle beyond an end is none.
 _GOES_ON_MM = 1.5
 # Images without stamps are of a sequence as fast as cameras are.
@@ -365,6 +367,23 @@ def _goes_on(
     ]
     shown = np.min(shares, axis=0) > GOES_ON_SHARE
     return bool(uniform_filter1d(shown.astype(np.float64), round(GOES_ON_MM / spacing), mode="constant").max() > 0.999)
+
+
+def is_line_beyond(
+    images: Images, rig: StereoRig, points_mm: Float, diameter_mm: float, parameters: BesideParameters
+) -> bool:
+    """Whether both views show a line as wide as the needle go on beyond the end of its curve (N, 3).
+
+    However faint: a needle whose contrast fades, behind which something crosses, seems to end there and does not.
+    """
+    even = _cut(points_mm, 0.0, float(arc_length(points_mm)[-1]), _BEYOND_STEP_MM)
+    first, last = (round(mm / _BEYOND_STEP_MM) for mm in _BEYOND_MM)
+    beyond = _beyond(even, last, _BEYOND_STEP_MM)[first:]
+    heights_gray = [
+        abs(line_height_gray(image, camera, pose.apply(beyond), diameter_mm))
+        for image, camera, pose in zip(images, *_views(rig), strict=True)
+    ]
+    return min(heights_gray) > parameters.faint_line_gray
 
 
 def _end_observation(

@@ -20,11 +20,14 @@ from needletrack.tracking.evidence import (
     LIVELY,
     OFFSETS,
     UNITS_PER_MAX_DIAMETER,
+    WIDE,
     Float32,
     Grid,
+    bank,
     log_evidence,
     log_evidence_by_background,
     log_evidence_of_no_needle,
+    no_needle_bank,
     over_none,
     products,
 )
@@ -167,28 +170,47 @@ def rows_of(image: Image) -> tuple[Image, int, int, int]:
     return contiguous, *contiguous.shape, contiguous.shape[1]
 
 
-def estimate_appearance(
-    views: tuple[Sections, Sections], needle: Needle, near: Appearance | None, grid: Grid, *, is_white: bool = False
-) -> Appearance:
-    """Diameter, blur and inside under which the sections of both views are likeliest; `near`: what they were before.
-
-    A white needle that saturates is dull, though its profile is cut off.
-    """
-    decisive = [np.unique(np.linspace(0, len(v.values) - 1, _DECIDING).astype(np.int64)) for v in views]
-    shown = products(np.concatenate([view.values[pick] for view, pick in zip(views, decisive, strict=True)]))
-    px_per_unit = float(np.median(np.concatenate([view.px_per_unit for view in views])))
+def _looks(needle: Needle, px_per_unit: float) -> tuple[list[int], list[int]]:
+    """The half widths and the blurs, as indices, that a needle may have where it is seen so large."""
     low, high = (
         margin * d / 2 / unit_mm(needle)
         for margin, d in zip(_DIAMETER_MARGIN, (needle.min_diameter_mm, needle.max_diameter_mm), strict=True)
     )
     widths = [i for i, w in enumerate(HALF_WIDTHS) if low <= w <= high]
     blurs = [i for i, b in enumerate(BLURS) if _BLURS_PX[0] <= b * px_per_unit <= _BLURS_PX[1]] or [len(BLURS) - 1]
+    return widths, blurs
+
+
+def make_banks(needle: Needle, px_per_unit: float) -> None:
+    """Make what every look of a needle is tried with: a third of a second, which no pair should wait for."""
+    widths, blurs = _looks(needle, px_per_unit)
+    for blur in blurs:
+        no_needle_bank(BLURS[blur])
+        for width in widths:
+            for inside in (DULL, LIVELY):
+                bank(float(HALF_WIDTHS[width]), BLURS[blur], inside, WIDE)
+
+
+def estimate_appearance(
+    views: tuple[Sections, Sections], needle: Needle, near: Appearance | None, grid: Grid, *, is_white: bool = False
+) -> Appearance:
+    """Diameter, blur and inside under which the sections of both views are likeliest; `near`: what they were before.
+
+    The axis may be as far away as the grid reaches; the coarse one tells looks apart as well as a fine one does, and
+    one set of banks is less to make. A white needle that saturates is dull, though its profile is cut off.
+    """
+    decisive = [np.unique(np.linspace(0, len(v.values) - 1, _DECIDING).astype(np.int64)) for v in views]
+    shown = products(np.concatenate([view.values[pick] for view, pick in zip(views, decisive, strict=True)]))
+    px_per_unit = float(np.median(np.concatenate([view.px_per_unit for view in views])))
+    widths, blurs = _looks(needle, px_per_unit)
     likely: dict[Appearance, Float] = {}
+    within = np.flatnonzero(np.abs(WIDE.shifts) <= grid.shifts[-1])
+    reached = slice(int(within[0]), int(within[-1]) + 1)
 
     def best(tried: list[Appearance]) -> Appearance:
         for each in tried:
             if each not in likely:
-                likely[each] = log_evidence(shown, each, grid).max(axis=1)
+                likely[each] = log_evidence(shown, each, WIDE)[:, reached].max(axis=1)
         table = np.stack([likely[each] for each in tried], axis=1)
         # A section of something else has no more of a say than _MOST_SAY.
         say = np.maximum(table - table.max(axis=1, keepdims=True), -_MOST_SAY).sum(axis=0)

@@ -18,8 +18,9 @@ from needletrack.tracking.detect import detect
 from needletrack.tracking.fit import initial_curve
 from needletrack.tracking.match import Candidate
 from needletrack.tracking.parameters import TrackingParameters
-from needletrack.tracking.refine import RefineModels, glanced, refine
+from needletrack.tracking.refine import RefineModels, glanced, is_line_beyond, refine
 from needletrack.tracking.shape import Shape, as_track, differ, judged
+from needletrack.tracking.silhouette import make_banks, unit_mm
 from needletrack.tracking.stopwatch import Stopwatch
 
 # Candidates this close to the best one in score are examined as well: two that hold make the shape ambiguous.
@@ -112,7 +113,7 @@ def search(
     try:
         candidates = detect(images, rig, parameters, stopwatch)
         shape, found = _best(candidates, [], images, rig, parameters, previous, stopwatch)
-        if _may_go_on(shape, candidates, rig):
+        if _may_go_on(shape, candidates, images, rig, parameters):
             shape = shape.doubted([Reason.TIP_NOT_SEEN])
     except NeedleNotFound as lost:
         lost_for = (Reason(lost.reason),)
@@ -121,6 +122,14 @@ def search(
         evidence = Evidence() if found is None else Evidence(found.left, found.right, found.correspondences)
         track = as_track(shape, pair.captured_at_ns, previous, 0, evidence, stopwatch.elapsed_ms)
     return replace(track, searched_sequence=pair.sequence)
+
+
+def warm_up(rig: StereoRig, parameters: TrackingParameters) -> None:
+    """Make ready what the first search needs: it takes a multiple of the next ones."""
+    blank = Frame(np.zeros(rig.left.size_px[::-1], np.uint8), 0)
+    search(StereoPair(blank, blank, 0), rig, parameters)
+    depth_mm = (parameters.workspace.z_mm.min + parameters.workspace.z_mm.max) / 2
+    make_banks(parameters.needle, rig.left.focal_px * unit_mm(parameters.needle) / depth_mm)
 
 
 def audit(pair: StereoPair, rig: StereoRig, parameters: TrackingParameters, followed: NeedleTrack) -> NeedleTrack:
@@ -159,7 +168,7 @@ def audit(pair: StereoPair, rig: StereoRig, parameters: TrackingParameters, foll
         return replace(with_doubts(followed, (Reason.AMBIGUOUS_SHAPE,)), searched_sequence=pair.sequence)
     if not any(_is_of(candidate, shape.curve.points_mm, rig) for candidate in candidates):
         shape = shape.doubted([Reason.AMBIGUOUS_SHAPE])
-    elif _may_go_on(shape, candidates, rig):
+    elif _may_go_on(shape, candidates, images, rig, parameters):
         shape = shape.doubted([Reason.TIP_NOT_SEEN])
     track = as_track(shape, pair.captured_at_ns, None, 0, Evidence(), stopwatch.elapsed_ms)
     track = replace(track, searched_sequence=pair.sequence)
@@ -233,6 +242,12 @@ def _best(
         # What is much worse matched is examined only for want of a shape that holds.
         if candidate.score < _RIVAL_SHARE * candidates[0].score and any(not shape.reasons for shape, _ in found):
             continue
+        # What lies along a shape that holds leads to it once more.
+        if any(
+            led_to is not None and not shape.reasons and _is_of(candidate, shape.curve.points_mm, rig)
+            for shape, led_to in found
+        ):
+            continue
         try:
             with stopwatch("refine"):
                 rough_mm = initial_curve(
@@ -258,9 +273,13 @@ def _best(
     return best, led_to
 
 
-def _may_go_on(shape: Shape, candidates: list[Candidate], rig: StereoRig) -> bool:
-    """Whether something was detected ahead of the tip that may be more of the needle, behind a stretch without."""
+def _may_go_on(
+    shape: Shape, candidates: list[Candidate], images: Images, rig: StereoRig, parameters: TrackingParameters
+) -> bool:
+    """Whether a line goes on beyond the tip, or something was detected ahead of it, that may be more of the needle."""
     points = shape.curve.points_mm
+    if is_line_beyond(images, rig, points, shape.refined.diameter_mm, parameters.beside):
+        return True
     ahead = unit(points[-1] - points[-4])
     for candidate in candidates:
         # What lies on the needle in one view is a ghost of it: its rim in one view paired with its streak in the other.

@@ -116,13 +116,13 @@ class About:
 class PairWriter:
     """Writes pairs and tracks into one new MCAP file; a chunk is in the kernel's hands as soon as it is full.
 
-    Raises RecordingError where the file exists or cannot be made; what writing raises later is an OSError, after
-    which nothing but `abandon` makes sense.
+    pairs: added so far; kept: of those, the ones that the kernel has. Raises RecordingError where the file exists or
+    cannot be made; what writing raises later is an OSError, after which nothing but `abandon` makes sense.
     """
 
     def __init__(self, path: Path, about: About) -> None:
         self.path, self._about = path, about
-        self.pairs = 0
+        self.pairs = self.kept = self._in_whole_chunks = 0
         try:
             self._file: IO[bytes] = path.open("xb")
         except FileExistsError as error:
@@ -162,21 +162,29 @@ class PairWriter:
         for topic, image, stamp_ns in ((LEFT_TOPIC, left, left_ns), (RIGHT_TOPIC, right, right_ns)):
             frame_id = f"{self._about.name}_{'left' if topic == LEFT_TOPIC else 'right'}"
             data = image_cdr(image, stamp_ns, frame_id)
-            self._writer.add_message(self._channels[topic], stamp_ns, data, stamp_ns, sequence & 0xFFFFFFFF)
+            self._add(topic, stamp_ns, data, sequence, pairs=self.pairs + (topic == RIGHT_TOPIC))
         self.pairs += 1
         self._file.flush()
+        self.kept = self._in_whole_chunks
 
     def add_track(self, sequence: int, captured_at_ns: int, message: bytes) -> None:
         """Add the published message of a pair, as it was published."""
         text = typestore().types[_STRING](data=message.decode())
         data = bytes(typestore().serialize_cdr(text, _STRING))
-        self._writer.add_message(
-            self._channels[TRACK_TOPIC], captured_at_ns, data, captured_at_ns, sequence & 0xFFFFFFFF
-        )
+        self._add(TRACK_TOPIC, captured_at_ns, data, sequence, pairs=self.pairs)
+
+    def _add(self, topic: str, stamp_ns: int, data: bytes, sequence: int, pairs: int) -> None:
+        """Add a message, with which so many pairs are whole; one that ends a chunk gives it to the file."""
+        before = self._file.tell()
+        self._writer.add_message(self._channels[topic], stamp_ns, data, stamp_ns, sequence & 0xFFFFFFFF)
+        if self._file.tell() > before:
+            self._in_whole_chunks = pairs
 
     def flush(self) -> None:
         """Give the kernel what is in the unfinished chunk."""
         self._writer.flush()  # type: ignore[no-untyped-call]
+        self._file.flush()
+        self.kept = self._in_whole_chunks = self.pairs
 
     def finish(self) -> None:
         """Write the index and close."""
@@ -184,6 +192,7 @@ class PairWriter:
         self._file.flush()
         os.fdatasync(self._file.fileno())
         self._file.close()
+        self.kept = self.pairs
 
     def abandon(self) -> None:
         """Close without an index, after an error: `recover` reads what is there."""

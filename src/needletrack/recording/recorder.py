@@ -21,14 +21,14 @@ from multiprocessing.connection import Connection, wait
 from multiprocessing.shared_memory import SharedMemory
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Self
+from typing import Any, Literal, Self
 
 import numpy as np
 
 from needletrack.errors import RecordingError
 from needletrack.publish.message import TrackMessage
 from needletrack.recording.mcap_file import About, PairWriter
-from needletrack.records import Image, NeedleTrack, StereoPair
+from needletrack.records import NeedleTrack, Pixels, StereoPair
 
 _log = logging.getLogger(__name__)
 
@@ -116,6 +116,15 @@ class _Freed:
     finished: int = 0
 
 
+@dataclass(frozen=True, slots=True)
+class _Memory:
+    """Where pairs wait to be written: (slot, camera, row, column)."""
+
+    name: str
+    shape: tuple[int, int, int, int]
+    dtype: str
+
+
 _Command = _Pair | _Track | _Finish | _Stop
 
 
@@ -128,8 +137,7 @@ class _Writing:
         self,
         settings: RecorderSettings,
         about: About,
-        memory_name: str,
-        shape: tuple[int, ...],
+        memory: "_Memory",
         after: RecorderState | None,
     ) -> None:
         context = multiprocessing.get_context("spawn")
@@ -137,7 +145,7 @@ class _Writing:
         self._answers, answers = context.Pipe(duplex=False)
         self._process = context.Process(
             target=_record,
-            args=(settings, about, memory_name, shape, commands, answers, after),
+            args=(settings, about, memory, commands, answers, after),
             name="needletrack-recorder",
             daemon=True,
         )
@@ -221,19 +229,27 @@ class Recorder:
     """Records pairs and their tracks; `offer` returns at once whatever the disk does, and counts what it cannot take.
 
     Where the writing process ends by itself, another one goes on in a new file. size_px: of the images. about: what the
-    file says of itself; clock, exposure and place of the stamp are those of the first pair. begun: record from now on,
-    else from `begin`. Raises RecordingError where the folder or file cannot be written.
+    file says of itself; clock, exposure and place of the stamp are those of the first pair. bits: of a pixel, as the
+    cameras give them. begun: record from now on, else from `begin`. Raises RecordingError where the folder or file
+    cannot be written.
     """
 
     def __init__(
-        self, settings: RecorderSettings, about: About, size_px: tuple[int, int], *, begun: bool = True
+        self,
+        settings: RecorderSettings,
+        about: About,
+        size_px: tuple[int, int],
+        *,
+        bits: Literal[8, 16] = 8,
+        begun: bool = True,
     ) -> None:
         _require_writable(settings)
         self._settings, self._about, self._shape = settings, about, (2, size_px[1], size_px[0])
-        bytes_a_pair = 2 * size_px[0] * size_px[1]
+        dtype = np.dtype(np.uint8 if bits == 8 else np.uint16)
+        bytes_a_pair = 2 * size_px[0] * size_px[1] * dtype.itemsize
         slots = max(settings.buffer_mb * _MB // bytes_a_pair, 4)
         self._memory = SharedMemory(create=True, size=slots * bytes_a_pair)
-        self._slots: Any = np.ndarray((slots, *self._shape), np.uint8, self._memory.buf)
+        self._slots: Any = np.ndarray((slots, *self._shape), dtype, self._memory.buf)
         self._free = deque(range(slots))
         self._state, self._first, self._warned_s = RecorderState(), True, 0.0
         # Between who offers, who begins and ends, and who keeps the process; held for an image's copy at most.
@@ -345,7 +361,8 @@ class Recorder:
         if self._first_sequence is None:
             self._first_sequence = pair.sequence
         self._last_sequence = pair.sequence
-        fits = pair.left.image.shape == pair.right.image.shape == self._shape[1:]
+        left, right = pair.left.pixels, pair.right.pixels
+        fits = left.shape == right.shape == self._shape[1:] and left.dtype == right.dtype == self._slots.dtype
         writing = self._writing if self._writing is not None and self._writing.is_alive else None
         if writing is None or self._closed.is_set() or not self._free or not fits:
             self.dropped += 1
@@ -353,8 +370,8 @@ class Recorder:
             self._warn(self._state.error or why)
             return False
         slot = self._free.popleft()
-        np.copyto(self._slots[slot, 0], pair.left.image)
-        np.copyto(self._slots[slot, 1], pair.right.image)
+        np.copyto(self._slots[slot, 0], left)
+        np.copyto(self._slots[slot, 1], right)
         about = None
         if self._first:
             self._first = False
@@ -411,8 +428,8 @@ class Recorder:
 
         after: what the one before said last. Raises RecordingError, OSError.
         """
-        shape = len(self._slots), *self._shape
-        writing = _Writing(self._settings, self._about, self._memory.name, shape, after)
+        memory = _Memory(self._memory.name, self._slots.shape, self._slots.dtype.str)
+        writing = _Writing(self._settings, self._about, memory, after)
         try:
             answer = writing.first_answer(self._closed)
         except BaseException:
@@ -520,8 +537,7 @@ def _require_writable(settings: RecorderSettings) -> None:
 def _record(
     settings: RecorderSettings,
     about: About,
-    memory_name: str,
-    shape: tuple[int, ...],
+    memory: _Memory,
     commands: Connection,
     answers: Connection,
     after: RecorderState | None,
@@ -536,8 +552,8 @@ def _record(
     with suppress(OSError):
         os.nice(_NICE)
     _keep_freed_memory()
-    memory = SharedMemory(memory_name)
-    slots: Any = np.ndarray(shape, np.uint8, memory.buf)
+    shared = SharedMemory(memory.name)
+    slots: Any = np.ndarray(memory.shape, memory.dtype, shared.buf)
     files = _Files(settings, about, after)
     files.probe()
     told = files.state
@@ -568,7 +584,7 @@ def _record(
     finally:
         del slots
         with suppress(BufferError):
-            memory.close()
+            shared.close()
 
 
 def _next(commands: Connection) -> _Command | None:
@@ -616,7 +632,7 @@ class _Files:
         except OSError as error:
             self._pause(_unwritable(folder, error))
 
-    def add_pair(self, command: _Pair, left: Image, right: Image) -> bool:
+    def add_pair(self, command: _Pair, left: Pixels, right: Pixels) -> bool:
         if command.about is not None:
             self._about = command.about
         return self._attempt(

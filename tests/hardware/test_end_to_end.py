@@ -34,7 +34,7 @@ from needletrack.geometry.spline import distance_from_curve
 from needletrack.publish.message import ServiceState, StatusMessage
 from needletrack.recording.asl import AslRecording
 from needletrack.recording.mcap_file import McapRecording, recover
-from needletrack.records import Clock, Status, StereoPair
+from needletrack.records import Clock, Frame, Status, StereoPair
 from needletrack.replay import Replay, open_recording
 from needletrack.scoring import recorded_truth
 
@@ -89,6 +89,18 @@ def daemon(config: Path) -> Iterator[subprocess.Popen[bytes]]:
             process.kill()
 
 
+def recorded(number: int) -> StereoPair:
+    """A pair of the bundled recording."""
+    return AslRecording(STEER).read(number)
+
+
+def grey(number: int) -> StereoPair:
+    """A pair with nothing in it but a little noise: tracking the first needle takes half a minute in the guest."""
+    width, height = AslRecording(STEER).rig.left.size_px
+    left, right = np.random.default_rng(number).integers(100, 103, (2, height, width), dtype=np.uint8)
+    return StereoPair(Frame(left, 0), Frame(right, 0), number)
+
+
 def runs(process: psutil.Process) -> bool:
     """Whether it has not ended; one that nobody has waited for has."""
     try:
@@ -98,12 +110,12 @@ def runs(process: psutil.Process) -> bool:
 
 
 @contextmanager
-def fed_cameras(subscriber: Subscriber) -> Iterator["Rig"]:
+def fed_cameras() -> Iterator["Rig"]:
     """The cameras, plugged in anew: a loopback device gives whoever opens it the last frames of before."""
-    size_px = AslRecording(STEER).rig.left.size_px
+    rig = AslRecording(STEER).rig
     with ExitStack() as opened:
-        left, right = (opened.enter_context(Feed(node, size_px)) for node in loopback_nodes()[:2])
-        yield Rig((left, right), subscriber)
+        left, right = (opened.enter_context(Feed(node, rig.left.size_px)) for node in loopback_nodes()[:2])
+        yield Rig((left, right), opened.enter_context(Subscriber(rig.name, [ENDPOINT])))
 
 
 class Rig:
@@ -111,7 +123,6 @@ class Rig:
 
     def __init__(self, feeds: tuple[Feed, Feed], subscriber: Subscriber) -> None:
         self._feeds, self._subscriber = feeds, subscriber
-        self._recorded = AslRecording(STEER)
 
     def ready(self, process: "subprocess.Popen[bytes]") -> None:
         """Wait until the daemon says that both cameras were started."""
@@ -122,9 +133,8 @@ class Rig:
 
         wait_for(started)
 
-    def feed(self, number: int) -> int:
+    def feed(self, pair: StereoPair) -> int:
         """Give both cameras a pair; its left stamp in microseconds."""
-        pair = self._recorded.read(number)
         stamp_us = time.monotonic_ns() // 1000
         for feed, frame, late_us in zip(self._feeds, (pair.left, pair.right), (0, SKEW_US), strict=True):
             feed.put(frame.image.tobytes(), stamp_us + late_us)
@@ -132,7 +142,7 @@ class Rig:
 
     def send(self, number: int) -> tuple[int, Any]:
         """Feed a pair and wait for its track: the stamp in microseconds, the message."""
-        stamp_us = self.feed(number)
+        stamp_us = self.feed(recorded(number))
         received = self._subscriber.next(WAIT_S)
         assert received is not None
         return stamp_us, received.message
@@ -194,14 +204,14 @@ def killed_while_it_records(process: "subprocess.Popen[bytes]", rig: Rig, folder
     rig.ready(process)
     for number in range(PAIRS - 1):
         before = size_of_recordings(folder)
-        rig.feed(number)
+        rig.feed(grey(number))
         # Nothing else comes, so that the unfinished chunk goes to the disk.
         wait_for(partial(lambda least: size_of_recordings(folder) > least, before + 100_000))
     (file,) = folder.glob("*.mcap")
     family = psutil.Process(process.pid).children(recursive=True)
     (recorder,) = (child for child in family if any(opened.path == str(file) for opened in child.open_files()))
     assert any(child != recorder and "spawn_main" in " ".join(child.cmdline()) for child in family)
-    rig.feed(PAIRS - 1)
+    rig.feed(grey(PAIRS - 1))
     # Stopped, it cannot finish the file when the daemon is gone.
     recorder.suspend()
     process.kill()
@@ -229,7 +239,7 @@ def pair_of_cameras_opened_again(config: Path, rig: Rig) -> StereoPair:
         first = executor.submit(next, source.pairs(threading.Event()))
         wait_for(lambda: {health.state for health in source.health.values()} == {CameraState.STARTING})
         assert source.health["left"].restarts == 0, source.last_error
-        rig.feed(0)
+        rig.feed(recorded(0))
         return first.result(WAIT_S)
 
 
@@ -240,13 +250,12 @@ def day(tmp_path_factory: pytest.TempPathFactory) -> Day:
     size_px = AslRecording(STEER).rig.left.size_px
     values = {"rig": STEER, "width": size_px[0], "height": size_px[1], "left": LEFT, "right": RIGHT}
     config.write_text(CONFIG.format(**values, endpoint=ENDPOINT, folder=recordings))
-    with Subscriber(AslRecording(STEER).rig.name, [ENDPOINT]) as subscriber:
-        with fed_cameras(subscriber) as rig, daemon(config) as process:
-            killed = killed_while_it_records(process, rig, recordings)
-        with fed_cameras(subscriber) as rig, daemon(config) as process:
-            stopped = stopped_while_it_records(process, rig, recordings, killed.file)
-        with fed_cameras(subscriber) as rig:
-            return Day(config, killed, stopped, pair_of_cameras_opened_again(config, rig))
+    with fed_cameras() as rig, daemon(config) as process:
+        killed = killed_while_it_records(process, rig, recordings)
+    with fed_cameras() as rig, daemon(config) as process:
+        stopped = stopped_while_it_records(process, rig, recordings, killed.file)
+    with fed_cameras() as rig:
+        return Day(config, killed, stopped, pair_of_cameras_opened_again(config, rig))
 
 
 def same_images(pair: StereoPair, true: StereoPair) -> bool:
@@ -267,9 +276,9 @@ def test_what_a_killed_daemon_recorded_is_saved_but_for_the_unwritten_tail(day: 
     pairs = recover(day.killed.file, saved).pairs
     # The tail is a chunk: it holds the pair that the recorder was at, and no other.
     assert day.killed.on_disk <= pairs <= day.killed.fed
-    recording, recorded = McapRecording(saved), AslRecording(STEER)
+    recording = McapRecording(saved)
     assert len(recording) == pairs
-    assert all(same_images(recording.read(number), recorded.read(number)) for number in range(pairs))
+    assert all(same_images(recording.read(number), grey(number)) for number in range(pairs))
 
 
 def test_a_daemon_that_is_asked_to_stop_while_it_records_ends_in_order(day: Day) -> None:
@@ -282,18 +291,18 @@ def test_a_daemon_that_is_asked_to_stop_while_it_records_ends_in_order(day: Day)
     assert len(recording) == PAIRS
     assert [track for _, track in recording.tracks()] == [message.to_json() for _, message in stopped.sent]
     # The cameras were free at once.
-    assert same_images(day.opened_again, AslRecording(STEER).read(0))
+    assert same_images(day.opened_again, recorded(0))
 
 
 def test_frames_to_tracks(day: Day, tmp_path: Path) -> None:
     """By the daemon that followed the killed one."""
-    recorded, truth = AslRecording(STEER), recorded_truth(STEER)
+    truth = recorded_truth(STEER)
     for number, (stamp_us, message) in enumerate(day.stopped.sent):
         assert message.captured_at_ns == stamp_us * 1000, "stamps are unchanged"
         assert (message.sequence, message.dropped) == (number, {})
         assert (message.clock, message.quality.pair_skew_us) == (Clock.MONOTONIC, SKEW_US)
         assert message.latency_ms > message.timing_ms["track"] > 0
-        true_mm = truth[recorded.pairs[number].left.stamp_ns].centerline_mm
+        true_mm = truth[recorded(number).captured_at_ns].centerline_mm
         off_mm = distance_from_curve(np.array(message.centerline_mm), true_mm)
         # What a status of ok promises, and what these frames give.
         assert np.percentile(off_mm, 95) < 1.0
@@ -301,7 +310,7 @@ def test_frames_to_tracks(day: Day, tmp_path: Path) -> None:
     assert sum(message.status is Status.OK for _, message in day.stopped.sent) > PAIRS // 2
 
     recording, config = McapRecording(day.stopped.file), load_config(day.config)
-    assert all(same_images(recording.read(number), recorded.read(number)) for number in range(PAIRS))
+    assert all(same_images(recording.read(number), recorded(number)) for number in range(PAIRS))
     output = tmp_path / "replayed.jsonl"
     Replay(open_recording(day.stopped.file, config), config, as_live=True).run(threading.Event(), output=output)
     published = [message for _, message in recording.tracks()]

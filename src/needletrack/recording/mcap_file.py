@@ -433,6 +433,8 @@ def recover(damaged: Path, output: Path) -> Recovered:
             for record in _Records(source, emit_chunks=True, validate_crcs=True).records:
                 copy.add(record)
                 whole_until = source.tell()
+            # The end's own mark.
+            whole_until = source.tell()
         except _CUT_OFF:
             pass  # here it was
         copy.finish()

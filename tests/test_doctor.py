@@ -148,6 +148,17 @@ def test_without_a_rig_the_rest_is_looked_at(tmp_path: Path) -> None:
     assert {"left camera", "disk"} <= {finding.subject for finding in found}
 
 
+def test_more_bits_need_a_faster_disk(tmp_path: Path) -> None:
+    def needed(pixels: str) -> float:
+        cameras = {"format": pixels, "size_px": (1280, 1024), "left": {"id": "usb-1"}, "right": {"id": "usb-2"}}
+        config = Config.model_validate({"cameras": cameras, "recording": {"folder": tmp_path}})
+        kernel = RunningKernel(two_cameras(SIZE_PX), lambda number: (GRAY, GRAY))
+        found = {each.subject: each for each in examine(config, calibrated, seconds=0.1, kernel=kernel)}
+        return float(found["disk"].seen.split("needs about ")[1].split(";")[0])
+
+    assert needed("Y12") == pytest.approx(2 * needed("GREY"), abs=2)
+
+
 def test_the_command_prints_a_line_each_and_fails_where_something_does(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

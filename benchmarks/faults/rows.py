@@ -326,17 +326,29 @@ def read_only(stage: Stage) -> Seen:
         return _refused(stage, "--record", str(disk))
 
 
-@fault("disk", "the recording process killed", "SIGKILL to it alone")
+@fault("disk", "the recording process killed", "SIGKILL to it alone; `needletrack recover` for its file")
 def recorder_killed(stage: Stage) -> Seen:
-    """Tracking does not depend on it."""
+    """Another one goes on in a new file; tracking does not depend on it."""
     daemon, watcher = stage.running("--record", str(stage.folder))
     watcher.heartbeat(0.0, lambda b: b["recording"]["pairs"] > 30, "a recording")
+    recorder, (first,) = daemon.recorder(), stage.folder.glob("*.mcap")
     at_s = time.monotonic()
-    os.kill(daemon.recorder(), signal.SIGKILL)
-    beat = watcher.heartbeat(at_s, lambda b: b["recording"]["dropped"] > 0, "a pair that was not recorded")
-    watcher.tracks(beat["at_s"], 20)
-    saw = f"recording.dropped grows in the status after {beat['at_s'] - at_s:.2f} s; tracks: {_changes(watcher, at_s)}"
-    return Seen(saw, 0.0, f"tracks: {_lost(watcher, at_s)}; recording: all that follows, until the daemon is restarted")
+    os.kill(recorder, signal.SIGKILL)
+    beat = watcher.heartbeat(at_s, lambda b: b["recording"]["error"], "an error of the recorder")
+    pairs = beat["heartbeat"]["recording"]["pairs"]
+    again = watcher.heartbeat(beat["at_s"], lambda b: b["recording"]["pairs"] > pairs, "a recording that goes on")
+    watcher.tracks(again["at_s"], 20)
+    _require(daemon.recorder() != recorder, "the recording process is the one that was killed")
+    saw = (
+        f"recording.error “{beat['heartbeat']['recording']['error']}” in the status; tracks: {_changes(watcher, at_s)}"
+    )
+    lost_tracks = _lost(watcher, at_s)
+    told = _stop(daemon)
+    (second,) = (len(McapRecording(path)) for path in stage.folder.glob("*.mcap") if path != first)
+    saved = recover(first, stage.folder / "saved.mcap").pairs
+    _require(saved + second >= int(str(told["recorded"])), f"{saved} and {second} pairs are there of {told}")
+    lost = f"tracks: {lost_tracks}; recording: {told['unrecorded']} pairs, all counted"
+    return Seen(saw, again["at_s"] - at_s, lost)
 
 
 @fault("disk", "power cut while recording", "SIGKILL to the daemon and its recorder; `needletrack recover`")

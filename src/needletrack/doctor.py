@@ -224,8 +224,9 @@ def _picture(side: str, image: Image) -> Finding:
 
 
 def _disk(config: Config) -> Iterator[Finding]:
-    width, height = config.cameras.size_px
-    needed = 2 * width * height * (config.cameras.rate_hz or 60.0) * _COMPRESSED_TO / 1e6
+    cameras = config.cameras
+    pair_bytes = 2 * cameras.size_px[0] * cameras.size_px[1] * cameras.recorded_bits // 8
+    needed = pair_bytes * (cameras.rate_hz or 60.0) * _COMPRESSED_TO / 1e6
     folder = config.recording.folder or Path.cwd()
     try:
         reached = _written_mb_per_s(folder)

@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
 from types import MappingProxyType
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -18,6 +18,8 @@ import numpy.typing as npt
 Float = npt.NDArray[np.float64]
 Int = npt.NDArray[np.int64]
 Image = npt.NDArray[np.uint8]
+Image16 = npt.NDArray[np.uint16]
+Pixels = Image | Image16
 
 
 def frozen_array(
@@ -135,13 +137,34 @@ class DropReason(StrEnum):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Frame:
-    """One camera's image (rows, columns) of uint8 and the driver's own stamp of it."""
+    """One camera's image (rows, columns) of uint8 and the driver's own stamp of it.
+
+    image16: the same picture as uint16 where the camera gives more than eight bits, else None; its upper eight, of the
+    full range, are `image`, which is tracked.
+    """
 
     image: Image
     captured_at_ns: int
+    image16: Image16 | None = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "image", frozen_array(self.image, (None, None), "image", np.uint8))
+        if self.image16 is not None:
+            object.__setattr__(self, "image16", frozen_array(self.image16, self.image.shape, "image16", np.uint16))
+
+    @classmethod
+    def of(cls, pixels: Pixels, captured_at_ns: int) -> "Frame":
+        """The frame of a picture (rows, columns) of uint8, or of uint16 in the full range."""
+        if pixels.dtype == np.uint16:
+            upper: Image = (pixels >> 8).astype(np.uint8)
+            upper.flags.writeable = False
+            return cls(upper, captured_at_ns, cast(Image16, pixels))
+        return cls(cast(Image, pixels), captured_at_ns)
+
+    @property
+    def pixels(self) -> Pixels:
+        """All that the camera gave: what is recorded."""
+        return self.image if self.image16 is None else self.image16
 
 
 @dataclass(frozen=True, slots=True, eq=False)

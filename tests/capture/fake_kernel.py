@@ -317,15 +317,15 @@ class RunningKernel(FakeKernel):
         self.stamps_us.append(stamp_us)
 
 
-def two_cameras(size_px: tuple[int, int], rate_hz: float = 50.0) -> list[FakeCamera]:
+def two_cameras(size_px: tuple[int, int], rate_hz: float = 50.0, pixels: str = "GREY") -> list[FakeCamera]:
     """A left and a right camera of a size, on two sockets of a bus."""
     return [
         FakeCamera(
             f"/dev/video{n}",
             f"usb-{n + 1}",
-            formats={"GREY": [size_px]},
+            formats={pixels: [size_px]},
             rates_hz=(rate_hz,),
-            stride=size_px[0],
+            stride=size_px[0] * (1 if pixels == "GREY" else 2),
         )
         for n in range(2)
     ]

@@ -8,7 +8,7 @@ import numpy.typing as npt
 import pytest
 
 from needletrack.capture.pixels import Layout, decoded
-from needletrack.records import Image
+from needletrack.records import Frame, Image
 
 WIDTH, HEIGHT = 10, 6
 PICTURE = np.random.default_rng(1).integers(0, 256, (HEIGHT, WIDTH), dtype=np.uint8)
@@ -36,15 +36,20 @@ def test_the_luminance_of_packed_colour(name: str, luminance: int) -> None:
 
 
 @pytest.mark.parametrize(("name", "bits"), [("Y10", 10), ("Y12", 12), ("Y16", 16), ("Y16", 12)])
-def test_the_upper_eight_of_the_bits_in_use(name: str, bits: int) -> None:
+def test_all_bits_in_use_in_the_full_range_whose_upper_eight_are_the_picture(name: str, bits: int) -> None:
     rest = np.random.default_rng(2).integers(0, 1 << (bits - 8), PICTURE.shape)
     words = ((PICTURE.astype(np.uint16) << (bits - 8)) + rest).astype("<u2")
-    assert np.array_equal(decoded(padded(words, 24), Layout(name, WIDTH, HEIGHT, 24, bits)), PICTURE)
+    got = decoded(padded(words, 24), Layout(name, WIDTH, HEIGHT, 24, bits))
+    assert got.dtype == np.uint16
+    assert np.array_equal(got >> (16 - bits), words)
+    frame = Frame.of(got, 0)
+    assert np.array_equal(frame.image, PICTURE)
+    assert np.array_equal(frame.pixels, got)
 
 
 def test_more_than_the_bits_in_use_is_white() -> None:
     words = np.full((HEIGHT, WIDTH), 0xFFFF, "<u2")
-    assert (decoded(padded(words, 20), Layout("Y16", WIDTH, HEIGHT, 20, 12)) == 255).all()
+    assert (Frame.of(decoded(padded(words, 20), Layout("Y16", WIDTH, HEIGHT, 20, 12)), 0).image == 255).all()
 
 
 def smooth() -> Image:

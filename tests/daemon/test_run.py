@@ -17,7 +17,7 @@ from datetime import UTC, datetime, timedelta
 from io import StringIO
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import pytest
@@ -37,9 +37,9 @@ from needletrack.errors import CaptureError, ConfigError, PublishError
 from needletrack.geometry.transform import RigidTransform
 from needletrack.publish.message import StatusMessage, TrackMessage
 from needletrack.recording.asl import AslRecording
-from needletrack.recording.mcap_file import McapRecording
+from needletrack.recording.mcap_file import McapRecording, PairWriter
 from needletrack.recording.registration import PointPairs, registered
-from needletrack.records import Clock, DropReason, StampPlace, Status
+from needletrack.records import Clock, DropReason, Image, Image16, StampPlace, Status
 from needletrack.replay import Replay, open_recording
 from needletrack.rig import CalibrationInfo, Rig, write_rig
 
@@ -230,12 +230,19 @@ def test_an_old_calibration_is_said_at_the_start_and_in_every_heartbeat(caplog: 
         assert status.calibration.warning == (said[0].getMessage() if is_old else None)
 
 
-def live_and_replayed(folder: Path, rig: Rig, count: int, *, rate_hz: float | None = None) -> list[TrackMessage]:
+def live_and_replayed(
+    folder: Path,
+    rig: Rig,
+    count: int,
+    *,
+    rate_hz: float | None = None,
+    pixels: Literal["GREY", "Y16"] = "GREY",
+) -> list[TrackMessage]:
     """What is published of so many pairs of steer-b; asserts that their replay gives the same bytes.
 
     They come one after another, each when the one before is done, or so often, however long tracking takes.
     """
-    recorded, cameras = AslRecording(STEER), two_cameras(rig.left.size_px)
+    recorded, cameras = AslRecording(STEER), two_cameras(rig.left.size_px, pixels=pixels)
     daemons: list[Daemon] = []
 
     def shown(number: int) -> tuple[bytes, bytes] | None:
@@ -247,10 +254,14 @@ def live_and_replayed(folder: Path, rig: Rig, count: int, *, rate_hz: float | No
         # Forward and backward, so that the needle never jumps.
         turns = number % (2 * len(recorded) - 2)
         pair = recorded.read(min(turns, 2 * len(recorded) - 2 - turns))
-        return pair.left.image.tobytes(), pair.right.image.tobytes()
+        return as_delivered(pair.left.image), as_delivered(pair.right.image)
+
+    def as_delivered(image: Image) -> bytes:
+        # Of sixteen bits the lower ones are the camera's noise.
+        return image.tobytes() if pixels == "GREY" else sixteen_bits(image).tobytes()
 
     # Sooner than by default, which takes more pairs than are played here.
-    config = config_for(rig, recording={"folder": folder}, drift={"least_pairs": 5})
+    config = config_for(rig, cameras={"format": pixels}, recording={"folder": folder}, drift={"least_pairs": 5})
     with running(rig, config, RunningKernel(cameras, shown, rate_hz or 50.0)) as daemon:
         # Whoever hears heartbeats is connected, and will miss no track.
         daemon.status(lambda status: status.cameras is not None)
@@ -264,10 +275,7 @@ def live_and_replayed(folder: Path, rig: Rig, count: int, *, rate_hz: float | No
     missed = count - len(published)
     assert summary.run.dropped == ({DropReason.OVERWRITTEN: missed} if missed else {})
     assert rate_hz is not None or not missed
-    output = folder / "replayed.jsonl"
-    Replay(open_recording(file, config), config, as_published=True).run(threading.Event(), output=output)
-    replayed = output.read_bytes().splitlines()
-    for ours, again in zip(published, replayed, strict=True):
+    for ours, again in zip(published, replayed(file, config, as_published=True), strict=True):
         assert json.dumps(without_times(ours)).encode() == json.dumps(without_times(again)).encode()
     return [TrackMessage.from_json(message) for message in published]
 
@@ -292,6 +300,38 @@ def test_recorded_live_and_replayed_give_the_same_bytes_in_the_robot_s_frame(tmp
     # Where the left camera stands in the robot's frame, and how far it sees.
     away_mm = np.linalg.norm(in_robot_mm - (412, -80, 950), axis=1)
     assert ((away_mm > 150) & (away_mm < 350)).all()
+
+
+def replayed(file: Path, config: Config, *, as_published: bool = False) -> list[bytes]:
+    """What a replay of a recording publishes."""
+    output = file.with_suffix(".jsonl")
+    Replay(open_recording(file, config), config, as_published=as_published).run(threading.Event(), output=output)
+    return output.read_bytes().splitlines()
+
+
+def sixteen_bits(image: Image) -> Image16:
+    """An image whose upper eight bits are these."""
+    lower = np.random.default_rng(int(image[0, 0])).integers(0, 256, image.shape, dtype=np.uint16)
+    words: Image16 = np.left_shift(image, 8, dtype=np.uint16) + lower
+    return words
+
+
+def test_sixteen_bits_are_recorded_and_tracked_live_and_in_the_replay_as_their_upper_eight(tmp_path: Path) -> None:
+    rig, count = AslRecording(STEER).rig, 2
+    assert live_and_replayed(tmp_path, rig, count, pixels="Y16")[0].centerline_mm
+    (file,) = tmp_path.glob("*.mcap")
+    recording = McapRecording(file)
+    eight = PairWriter(tmp_path / "eight.mcap", recording.about)
+    for number in range(count):
+        read, true = recording.read(number), AslRecording(STEER).read(number)
+        assert np.array_equal(read.left.pixels, sixteen_bits(true.left.image))
+        assert np.array_equal(read.right.pixels, sixteen_bits(true.right.image))
+        stamps_ns = read.left.captured_at_ns, read.right.captured_at_ns
+        eight.add_pair(number, true.left.image, stamps_ns[0], true.right.image, stamps_ns[1])
+    eight.finish()
+    config = Config.model_validate_json(recording.about.config)
+    of_sixteen, of_eight = (replayed(path, config) for path in (file, tmp_path / "eight.mcap"))
+    assert list(map(without_times, of_sixteen)) == list(map(without_times, of_eight))
 
 
 @pytest.mark.slow

@@ -161,6 +161,8 @@ def test_a_file_cut_off_is_told_and_saved(tmp_path: Path, lost: float) -> None:
     assert got.pairs >= min(8, kept * 8 // ends - 1)
     assert got.pairs == 8 or kept < ends
     assert got.tracks == got.pairs
+    # Of what was saved, which is whole, nothing is lost.
+    assert recover(saved, tmp_path / "again.mcap") == replace(got, lost_bytes=0)
     assert recording.rig.digest == small_rig().digest
     for n in range(got.pairs):
         assert np.array_equal(recording.read(n).left.image, image_of(START_NS + n * 10 * MS))

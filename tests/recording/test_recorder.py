@@ -1,6 +1,7 @@
 """The recorder: what is offered is on the disk, and nothing that the disk does holds anybody up."""
 
 import errno
+import multiprocessing
 import os
 import signal
 import subprocess
@@ -10,6 +11,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -90,13 +92,95 @@ def test_a_recorder_that_does_not_keep_up_costs_counted_pairs_and_no_time(tmp_pa
     assert recorder.recorded == len(McapRecording(tmp_path / "r.mcap"))
 
 
-def test_a_recorder_that_is_killed_is_told_and_tracking_goes_on(tmp_path: Path) -> None:
-    with Recorder(RecorderSettings(tmp_path, tmp_path / "r.mcap"), ABOUT, SIZE_PX) as recorder:
+def killed(recorder: Recorder) -> None:
+    """Kill the writing process, and wait until that is noticed."""
+    pid = recorder.pid
+    assert pid is not None
+    os.kill(pid, signal.SIGKILL)
+    wait_for(lambda: recorder.pid != pid)
+
+
+def test_after_a_recorder_that_is_killed_another_goes_on_in_a_new_file(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    file, numbers = tmp_path / "r.mcap", count()
+    with Recorder(RecorderSettings(tmp_path, file), ABOUT, SIZE_PX) as recorder:
+
+        def recorded() -> bool:
+            offered = pair(next(numbers))
+            taken = recorder.offer(offered)
+            recorder.take(offered, *message(offered))
+            return taken
+
+        # These are on the disk, as nothing follows at once; those that follow are in an unfinished chunk.
+        assert all(recorded() for _ in range(5))
+        wait_for(lambda: file.stat().st_size > 6000)
+        wait_for(lambda: recorded() and recorder.state.kept >= 5)
+        kept = recorder.state.kept
+        killed(recorder)
+        assert not recorded()
+        assert "the recording process was killed by SIGKILL" in str(recorder.state.error)
+        assert not recorder.state.is_open
+        wait_for(recorded)
+        assert all(recorded() for _ in range(5))
+    assert (recorder.state.error, recorder.state.file) == (None, str(tmp_path / "r-1.mcap"))
+    assert "recording goes on" in caplog.text
+    # Each pair is in one of the files, or is counted as dropped.
+    saved, second = tmp_path / "saved.mcap", McapRecording(tmp_path / "r-1.mcap")
+    assert recover(file, saved).pairs == len(McapRecording(saved)) == kept
+    assert recorder.recorded == recorder.state.pairs == kept + len(second)
+    assert recorder.offered == recorder.recorded + recorder.dropped == next(numbers)
+    assert recorder.dropped > 0
+    assert len(second.tracks()) == len(second) >= 6
+    assert second.about.exposure_ns == 2 * MS
+
+
+def test_a_recorder_that_is_killed_again_and_again_is_started_more_and_more_rarely(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(recorder_module, "_RETRY_AFTER_S", 1000.0)
+    monkeypatch.setattr(recorder_module, "_RETRY_WITHIN_S", 1000.0)
+    with Recorder(RecorderSettings(tmp_path), ABOUT, SIZE_PX, begun=False) as recorder:
+        killed(recorder)
+        wait_for(lambda: recorder.pid is not None)
+        killed(recorder)
+        # Not before its time, and whoever wants to record is told.
+        time.sleep(0.5)
+        assert recorder.pid is None
+        assert recorder.begin()
+        assert not recorder.offer(pair(0))
+        assert "SIGKILL" in str(recorder.state.error)
+    assert (recorder.offered, recorder.recorded, recorder.dropped) == (1, 0, 1)
+
+
+def test_a_recorder_that_cannot_be_started_again_is_told_and_tried_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(recorder_module, "_RETRY_AFTER_S", 0.05)
+    with Recorder(RecorderSettings(tmp_path), ABOUT, SIZE_PX) as recorder:
+
+        def no_process(*unused: object) -> None:
+            raise OSError(errno.EAGAIN, os.strerror(errno.EAGAIN))
+
+        with monkeypatch.context() as short_of_processes:
+            short_of_processes.setattr(recorder_module, "_Writing", no_process)
+            killed(recorder)
+            wait_for(lambda: os.strerror(errno.EAGAIN) in str(recorder.state.error))
+            assert not recorder.offer(pair(0))
+        wait_for(lambda: recorder.offer(pair(1)))
+    assert recorder.recorded == 1
+
+
+def test_a_recorder_can_be_closed_whatever_becomes_of_its_process(tmp_path: Path) -> None:
+    for wait_s in (0.0, 0.01, 0.3):
+        recorder = Recorder(RecorderSettings(tmp_path), ABOUT, SIZE_PX)
         recorder.offer(pair(0))
         assert recorder.pid is not None
         os.kill(recorder.pid, signal.SIGKILL)
-        wait_for(lambda: not recorder.offer(pair(1)))
-    assert recorder.offered == recorder.recorded + recorder.dropped
+        time.sleep(wait_s)
+        recorder.close()
+        assert recorder.offered == recorder.recorded + recorder.dropped == 1
+        assert multiprocessing.active_children() == []
 
 
 RECORD = """
@@ -111,7 +195,7 @@ if __name__ == "__main__":
         while not recorder.offer(pair(number % 50)):
             time.sleep(0.01)
     while recorder.recorded < count:
-        recorder._collect(0.1)
+        recorder._collect(recorder._writing, 0.1)
     print(recorder.pid, flush=True)
     time.sleep(600)
 """
@@ -288,5 +372,5 @@ def test_an_end_of_a_recorder_that_is_gone_is_told(tmp_path: Path) -> None:
         tracked(recorder, 0)
         assert recorder.pid is not None
         os.kill(recorder.pid, signal.SIGKILL)
-        with pytest.raises(RecordingError, match="the recorder has ended"):
+        with pytest.raises(RecordingError, match="the recording process has ended"):
             recorder.end(WAIT_S)

@@ -16,7 +16,7 @@ from needletrack.capture.pixels import Layout, decoded
 from needletrack.capture.settings import CamerasSettings, PixelFormat
 from needletrack.capture.v4l2_abi import Request
 from needletrack.errors import CaptureError
-from needletrack.records import Clock, Image, StampPlace
+from needletrack.records import Clock, Pixels, StampPlace
 
 Side = Literal["left", "right"]
 
@@ -60,7 +60,7 @@ class Grab:
     clock: None where the driver names none.
     """
 
-    image: Image | None
+    image: Pixels | None
     fault: str
     stamp_ns: int
     sequence: int

@@ -219,7 +219,7 @@ class LiveSource:
         account.stamps_ns.append(grab.stamp_ns)
         account.stamp_at = grab.stamp_at
         self._skews.add(side, grab.stamp_ns)
-        frame = Frame(grab.image, grab.stamp_ns)
+        frame = Frame.of(grab.image, grab.stamp_ns)
         for decided in pairer.add(side, grab.stamp_ns, _Arrived(frame, grab)):
             if isinstance(decided, Paired):
                 yield self._pair(decided.left, decided.right)

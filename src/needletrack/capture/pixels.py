@@ -1,4 +1,4 @@
-"""Driver buffers to 8-bit gray images."""
+"""Driver buffers to gray images."""
 
 from dataclasses import dataclass
 
@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 
 from needletrack.reading import picture
-from needletrack.records import Image
+from needletrack.records import Image, Image16, Pixels
 
 _END_OF_JPEG = b"\xff\xd9"
 # Where the first luminance byte lies in two, for the packed formats.
@@ -25,18 +25,18 @@ class Layout:
     bits: int = 16
 
 
-def decoded(data: bytes | memoryview, layout: Layout) -> Image:
+def decoded(data: bytes | memoryview, layout: Layout) -> Pixels:
     """The picture in a buffer as a new read-only array (rows, columns); nothing of the buffer is kept.
 
-    Of more than eight bits the upper eight in use are kept. Raises ValueError where the buffer is too short, or
-    no whole JPEG of the size.
+    uint8; of more than eight bits uint16, the bits in use moved up to the full range, more than those being white.
+    Raises ValueError where the buffer is too short, or no whole JPEG of the size.
     """
-    image = _jpeg(data, layout) if layout.format == "MJPG" else _packed(data, layout)
+    image: Pixels = _jpeg(data, layout) if layout.format == "MJPG" else _packed(data, layout)
     image.flags.writeable = False
     return image
 
 
-def _packed(data: bytes | memoryview, layout: Layout) -> Image:
+def _packed(data: bytes | memoryview, layout: Layout) -> Pixels:
     wanted = layout.stride * layout.height
     if len(data) < wanted:
         raise ValueError(f"{len(data)} bytes in place of {wanted}")
@@ -46,10 +46,10 @@ def _packed(data: bytes | memoryview, layout: Layout) -> Image:
     row_bytes = rows[:, : 2 * layout.width]
     if layout.format in _LUMINANCE:
         return np.ascontiguousarray(row_bytes[:, _LUMINANCE[layout.format] :: 2])
-    shift = _BITS.get(layout.format, layout.bits) - 8
-    words = np.ascontiguousarray(row_bytes).view("<u2") >> shift
-    gray: Image = np.minimum(words, 255).astype(np.uint8)
-    return gray
+    bits = _BITS.get(layout.format, layout.bits)
+    words = np.ascontiguousarray(row_bytes).view("<u2")
+    full: Image16 = np.minimum(words, np.uint16((1 << bits) - 1)).astype(np.uint16, copy=False)
+    return np.left_shift(full, 16 - bits, out=full)
 
 
 def _jpeg(data: bytes | memoryview, layout: Layout) -> Image:

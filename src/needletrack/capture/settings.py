@@ -38,7 +38,8 @@ class CamerasSettings(BaseModel):
         {}, description="Further controls of both, as `v4l2-ctl --list-ctrls` names them, e.g. { trigger_mode = 1 }."
     )
     significant_bits: Annotated[int, Ge(8), Le(16)] = Field(
-        16, description="Of Y16: how many of the lower bits the sensor fills; the upper 8 of them are kept."
+        16,
+        description="Of Y16: how many of the lower bits the sensor fills; the upper 8 are tracked, all recorded.",
     )
     clock: Literal["driver", "monotonic", "realtime"] = Field(
         "driver", description="Clock of the stamps: what the driver says, or one where it says nothing."
@@ -47,6 +48,11 @@ class CamerasSettings(BaseModel):
     stall_s: Positive = Field(0.5, description="Without a frame for so long, seconds, a camera has stalled.")
     left: CameraSettings = Field(CameraSettings(), description="The left camera.")
     right: CameraSettings = Field(CameraSettings(), description="The right camera.")
+
+    @property
+    def recorded_bits(self) -> Literal[8, 16]:
+        """Bits of a pixel in a recording."""
+        return 16 if self.format in ("Y10", "Y12", "Y16") else 8
 
     def of(self, side: Literal["left", "right"]) -> CameraSettings:
         """One camera's own settings."""

@@ -58,7 +58,8 @@ def record(
         config.recording.min_free_mb,
         config.recording.max_file_mb,
     )
-    with Recorder(settings, About(rig, name, config=config.model_dump_json()), config.cameras.size_px) as recorder:
+    about = About(rig, name, config=config.model_dump_json())
+    with Recorder(settings, about, config.cameras.size_px, bits=config.cameras.recorded_bits) as recorder:
         schedule_thread("capture", config.daemon.realtime_priority, config.daemon.cpus)
         began_s: float | None = None
         until_s: float | None = None

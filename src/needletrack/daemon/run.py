@@ -119,6 +119,7 @@ class Daemon:
                     _recorder_settings(config),
                     self._about(config),
                     config.cameras.size_px,
+                    bits=config.cameras.recorded_bits,
                     begun=config.recording.at_start,
                 )
                 opened.callback(self._recorder.close, _RECORDER_ENDS_WITHIN_S)

@@ -12,7 +12,7 @@ from needletrack.errors import RecordingError
 from needletrack.reading import text_of
 from needletrack.recording.pairing import in_order, pair_by_stamp
 from needletrack.recording.png import UnusableImage, png_size, read_gray
-from needletrack.records import Clock, DropReason, Frame, Image, StereoPair
+from needletrack.records import Clock, DropReason, Frame, Pixels, StereoPair
 from needletrack.rig import Rig, find_rig
 
 LAYOUT = "EuRoC/ASL layout: cam0/data.csv and cam0/data/*.png for the left camera, cam1 for the right one"
@@ -110,7 +110,7 @@ class AslRecording:
                     _loss_in_pair(listed.right, right, DropReason.UNPAIRED_RIGHT, index),
                 )
             )
-        frames = Frame(left, listed.left.stamp_ns), Frame(right, listed.right.stamp_ns)
+        frames = Frame.of(left, listed.left.stamp_ns), Frame.of(right, listed.right.stamp_ns)
         return StereoPair(*frames, sequence=index, clock=Clock.RECORDED)
 
 
@@ -168,14 +168,14 @@ class _Camera:
         return losses
 
 
-def _image_or_fault(frame: ListedFrame, size_px: tuple[int, int]) -> Image | UnusableImage:
+def _image_or_fault(frame: ListedFrame, size_px: tuple[int, int]) -> Pixels | UnusableImage:
     try:
         return read_gray(frame.path, size_px)
     except UnusableImage as error:
         return error
 
 
-def _loss_in_pair(frame: ListedFrame, found: Image | UnusableImage, unpaired: DropReason, before: int) -> Loss:
+def _loss_in_pair(frame: ListedFrame, found: Pixels | UnusableImage, unpaired: DropReason, before: int) -> Loss:
     if isinstance(found, UnusableImage):
         return Loss(found.reason, frame.path, found.fault, before)
     return Loss(unpaired, frame.path, "its partner is lost", before)

@@ -31,6 +31,7 @@ from needletrack.recording.mcap_file import (
     UNCALIBRATED,
     About,
     PairWriter,
+    gray16,
     image_cdr,
     size_only_rig,
     typestore,
@@ -38,8 +39,9 @@ from needletrack.recording.mcap_file import (
     unpacked_zstd,
 )
 from needletrack.recording.pairing import in_order, pair_by_stamp
+from needletrack.recording.png import as_gray
 from needletrack.recording.replay import StoredRecording
-from needletrack.records import Clock, DropReason, Frame, Image, StereoPair
+from needletrack.records import Clock, DropReason, Frame, Pixels, StereoPair
 from needletrack.rig import Rig
 
 _IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
@@ -117,7 +119,7 @@ class BagRecording:
 
     def read(self, index: int) -> StereoPair:
         """The pair at an index, which is its sequence number; raises UnusablePair."""
-        images: list[Image] = []
+        images: list[Pixels] = []
         losses: list[Loss] = []
         size_px = self.rig.left.size_px
         sides = zip(
@@ -139,7 +141,7 @@ class BagRecording:
         if len(images) < 2:
             raise UnusablePair(tuple(losses))
         left, right = self._stored[index]
-        frames = Frame(images[0], left.stamp_ns), Frame(images[1], right.stamp_ns)
+        frames = Frame.of(images[0], left.stamp_ns), Frame.of(images[1], right.stamp_ns)
         return StereoPair(*frames, sequence=index, clock=Clock.RECORDED)
 
     def close(self) -> None:
@@ -228,7 +230,7 @@ def write_recording(
                 left_out.append(str(error))
                 continue
             stamps = pair.left.captured_at_ns, pair.right.captured_at_ns
-            writer.add_pair(index, pair.left.image, stamps[0], pair.right.image, stamps[1])
+            writer.add_pair(index, pair.left.pixels, stamps[0], pair.right.pixels, stamps[1])
             progress(index + 1)
         writer.finish()
     except OSError as error:
@@ -265,7 +267,7 @@ def write_bag(
                 for number, frame in enumerate((pair.left, pair.right)):
                     frame_id = f"{rig.name}_{('left', 'right')[number]}"
                     at = frame.captured_at_ns
-                    bag.write(images[number], at, bytes(image_cdr(frame.image, at, frame_id)))
+                    bag.write(images[number], at, bytes(image_cdr(frame.pixels, at, frame_id)))
                     if with_rig:
                         bag.write(infos[number], at, _camera_info(rig, number, at, frame_id))
                 count += 1
@@ -369,23 +371,14 @@ def _two_topics(path: Path, reader: AnyReader, topics: tuple[str, str] | None) -
     raise RecordingError(f"{path}: which topics are left and right? Say it with --left and --right: {here}")
 
 
-def _gray(message: Any) -> Image:
-    """The picture of a message as 8-bit gray (rows, columns), read-only; ValueError where it cannot be decoded."""
+def _gray(message: Any) -> Pixels:
+    """The picture of a message as gray (rows, columns), read-only; ValueError where it cannot be decoded."""
     if not hasattr(message, "encoding"):
-        pixels: Any = picture(message.data)
-        if pixels.ndim == 3:
-            pixels = cv2.cvtColor(pixels, cv2.COLOR_BGRA2GRAY if pixels.shape[2] == 4 else cv2.COLOR_BGR2GRAY)
-        encoding = "mono8" if pixels.dtype == np.uint8 else "mono16"
-    else:
-        encoding = message.encoding
-        pixels = _raw(message)
-    if encoding in _BITS_16:
-        gray = (pixels >> 8).astype(np.uint8)
-    elif encoding in _TO_GRAY:
-        gray = cv2.cvtColor(np.ascontiguousarray(pixels), _TO_GRAY[encoding])
-    else:
-        gray = np.ascontiguousarray(pixels)
-    image: Image = np.array(gray, np.uint8)
+        return as_gray(picture(message.data))
+    pixels = _raw(message)
+    if message.encoding in _TO_GRAY:
+        pixels = cv2.cvtColor(np.ascontiguousarray(pixels), _TO_GRAY[message.encoding])
+    image: Pixels = np.array(pixels)
     image.flags.writeable = False
     return image
 
@@ -400,7 +393,6 @@ def _raw(message: Any) -> Any:
     if encoding in _GRAY:
         return rows[:, : message.width]
     if encoding in _BITS_16:
-        kind = ">u2" if message.is_bigendian else "<u2"
-        return np.ascontiguousarray(rows[:, : 2 * message.width]).view(kind)
+        return gray16(rows, message)
     channels = 4 if "a8" in encoding else 3
     return rows[:, : channels * message.width].reshape(message.height, message.width, channels)

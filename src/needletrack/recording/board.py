@@ -349,7 +349,7 @@ class BoardRecorder:
         """Add a pair: its images first, then their lines."""
         for camera, frame in (("cam0", pair.left), ("cam1", pair.right)):
             name = f"{frame.captured_at_ns}.png"
-            whole, data = cv2.imencode(".png", frame.image)
+            whole, data = cv2.imencode(".png", frame.pixels)
             path = self.folder / camera / "data" / name
             try:
                 if not whole:

@@ -40,7 +40,7 @@ from needletrack.geometry.camera import Camera
 from needletrack.geometry.transform import RigidTransform
 from needletrack.reading import opened
 from needletrack.recording.asl import ListedFrame, ListedPair, Loss, UnusablePair
-from needletrack.records import Clock, DropReason, Frame, Image, StampPlace, StereoPair
+from needletrack.records import Clock, DropReason, Frame, Image, Image16, Pixels, StampPlace, StereoPair
 from needletrack.rig import Rig, rig_from_text, rig_text
 
 PROFILE = "ros2"
@@ -116,13 +116,13 @@ class About:
 class PairWriter:
     """Writes pairs and tracks into one new MCAP file; a chunk is in the kernel's hands as soon as it is full.
 
-    Raises RecordingError where the file exists or cannot be made; what writing raises later is an OSError, after
-    which nothing but `abandon` makes sense.
+    pairs: added so far; kept: of those, the ones that the kernel has. Raises RecordingError where the file exists or
+    cannot be made; what writing raises later is an OSError, after which nothing but `abandon` makes sense.
     """
 
     def __init__(self, path: Path, about: About) -> None:
         self.path, self._about = path, about
-        self.pairs = 0
+        self.pairs = self.kept = self._in_whole_chunks = 0
         try:
             self._file: IO[bytes] = path.open("xb")
         except FileExistsError as error:
@@ -157,26 +157,34 @@ class PairWriter:
         """The file's descriptor, for syncing it to the disk."""
         return self._file.fileno()
 
-    def add_pair(self, sequence: int, left: Image, left_ns: int, right: Image, right_ns: int) -> None:
+    def add_pair(self, sequence: int, left: Pixels, left_ns: int, right: Pixels, right_ns: int) -> None:
         """Add a pair's images (rows, columns) with their stamps."""
         for topic, image, stamp_ns in ((LEFT_TOPIC, left, left_ns), (RIGHT_TOPIC, right, right_ns)):
             frame_id = f"{self._about.name}_{'left' if topic == LEFT_TOPIC else 'right'}"
             data = image_cdr(image, stamp_ns, frame_id)
-            self._writer.add_message(self._channels[topic], stamp_ns, data, stamp_ns, sequence & 0xFFFFFFFF)
+            self._add(topic, stamp_ns, data, sequence, pairs=self.pairs + (topic == RIGHT_TOPIC))
         self.pairs += 1
         self._file.flush()
+        self.kept = self._in_whole_chunks
 
     def add_track(self, sequence: int, captured_at_ns: int, message: bytes) -> None:
         """Add the published message of a pair, as it was published."""
         text = typestore().types[_STRING](data=message.decode())
         data = bytes(typestore().serialize_cdr(text, _STRING))
-        self._writer.add_message(
-            self._channels[TRACK_TOPIC], captured_at_ns, data, captured_at_ns, sequence & 0xFFFFFFFF
-        )
+        self._add(TRACK_TOPIC, captured_at_ns, data, sequence, pairs=self.pairs)
+
+    def _add(self, topic: str, stamp_ns: int, data: bytes, sequence: int, pairs: int) -> None:
+        """Add a message, with which so many pairs are whole; one that ends a chunk gives it to the file."""
+        before = self._file.tell()
+        self._writer.add_message(self._channels[topic], stamp_ns, data, stamp_ns, sequence & 0xFFFFFFFF)
+        if self._file.tell() > before:
+            self._in_whole_chunks = pairs
 
     def flush(self) -> None:
         """Give the kernel what is in the unfinished chunk."""
         self._writer.flush()  # type: ignore[no-untyped-call]
+        self._file.flush()
+        self.kept = self._in_whole_chunks = self.pairs
 
     def finish(self) -> None:
         """Write the index and close."""
@@ -184,6 +192,7 @@ class PairWriter:
         self._file.flush()
         os.fdatasync(self._file.fileno())
         self._file.close()
+        self.kept = self.pairs
 
     def abandon(self) -> None:
         """Close without an index, after an error: `recover` reads what is there."""
@@ -199,8 +208,8 @@ class PairWriter:
         return number
 
 
-def image_cdr(image: Image, stamp_ns: int, frame_id: str) -> bytes:
-    """A sensor_msgs/Image of an 8-bit gray picture, serialized."""
+def image_cdr(image: Pixels, stamp_ns: int, frame_id: str) -> bytes:
+    """A sensor_msgs/Image of a gray picture, serialized: mono8 or mono16."""
     types = typestore().types
     seconds, nanoseconds = divmod(stamp_ns, 1_000_000_000)
     height, width = image.shape
@@ -210,13 +219,19 @@ def image_cdr(image: Image, stamp_ns: int, frame_id: str) -> bytes:
         ),
         height=height,
         width=width,
-        encoding="mono8",
+        encoding="mono8" if image.dtype == np.uint8 else "mono16",
         is_bigendian=0,
-        step=width,
-        data=np.ascontiguousarray(image).reshape(-1),
+        step=width * image.itemsize,
+        data=np.ascontiguousarray(image).reshape(-1).view(np.uint8),
     )
     # A view, which to the library is as good as bytes: a copy less of the image.
     return cast(bytes, memoryview(typestore().serialize_cdr(message, _IMAGE)).cast("B"))
+
+
+def gray16(rows: Image, message: Any) -> Image16:
+    """The picture of a mono16 message, whose rows of bytes these are."""
+    words = np.ascontiguousarray(rows[:, : 2 * message.width]).view(">u2" if message.is_bigendian else "<u2")
+    return words.astype(np.uint16, copy=False)
 
 
 @dataclass(frozen=True, slots=True)
@@ -284,7 +299,8 @@ class McapRecording:
     def read(self, index: int) -> StereoPair:
         """The pair at an index, which is its sequence number; raises UnusablePair."""
         left, right = self._places[index]
-        frames = Frame(self._image(left, index), left.stamp_ns), Frame(self._image(right, index), right.stamp_ns)
+        images = self._image(left, index), self._image(right, index)
+        frames = Frame.of(images[0], left.stamp_ns), Frame.of(images[1], right.stamp_ns)
         about = self.about
         return StereoPair(
             *frames, sequence=index, clock=Clock.RECORDED, exposure_ns=about.exposure_ns, stamp_at=about.stamp_at
@@ -302,10 +318,12 @@ class McapRecording:
         """Close the file; done by itself when nobody has the recording any more."""
         self._close_file()
 
-    def _image(self, place: _Place, index: int) -> Image:
+    def _image(self, place: _Place, index: int) -> Pixels:
         try:
             message: Any = typestore().deserialize_cdr(self._message(place), _IMAGE)
-            image = np.asarray(message.data, np.uint8).reshape(message.height, message.step)[:, : message.width]
+            rows = np.asarray(message.data, np.uint8).reshape(message.height, message.step)
+            is_16 = message.encoding == "mono16"
+            image: Pixels = gray16(rows, message) if is_16 else rows[:, : message.width]
         except _CUT_OFF as error:
             reasons = (DropReason.UNREADABLE_IMAGE, DropReason.UNPAIRED_LEFT)
             losses = tuple(Loss(reason, self.folder, f"pair {index}: {error}", index) for reason in reasons)
@@ -415,6 +433,8 @@ def recover(damaged: Path, output: Path) -> Recovered:
             for record in _Records(source, emit_chunks=True, validate_crcs=True).records:
                 copy.add(record)
                 whole_until = source.tell()
+            # The end's own mark.
+            whole_until = source.tell()
         except _CUT_OFF:
             pass  # here it was
         copy.finish()

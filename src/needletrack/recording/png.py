@@ -1,16 +1,18 @@
-"""One recorded image: a whole PNG of the expected size, as 8-bit gray, or the reason why not."""
+"""One recorded image: a whole PNG of the expected size, as gray, or the reason why not."""
 
 import os
 import struct
 import zlib
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
+import numpy.typing as npt
 
 from needletrack.errors import RecordingError
 from needletrack.reading import opened, picture
-from needletrack.records import DropReason, Image
+from needletrack.records import DropReason, Pixels
 
 _SIGNATURE = b"\x89PNG\r\n\x1a\n"
 _HEADER_BYTES = 33  # signature and the whole IHDR chunk
@@ -37,11 +39,11 @@ def png_size(path: Path) -> tuple[int, int] | None:
         return None
 
 
-def read_gray(path: Path, size_px: tuple[int, int]) -> Image:
-    """The image (rows, columns) of uint8, read-only; raises UnusableImage.
+def read_gray(path: Path, size_px: tuple[int, int]) -> Pixels:
+    """The image (rows, columns) of uint8, of a gray one of 16 bits uint16; read-only; raises UnusableImage.
 
     Colour is weighed as OpenCV's BGR2GRAY does (ITU-R BT.601: 0.299 R + 0.587 G + 0.114 B), alpha is left
-    out, and 16 bits keep their upper 8. Nothing is decoded before the header's size is the expected one and
+    out, and 16 bits of it keep their upper 8. Nothing is decoded before the header's size is the expected one and
     every chunk's checksum right: whether a decoder refuses half a picture depends on its version.
     """
     width, height = size_px
@@ -67,11 +69,17 @@ def read_gray(path: Path, size_px: tuple[int, int]) -> Image:
         pixels = picture(data)
     except ValueError as error:
         raise UnusableImage(path, DropReason.UNREADABLE_IMAGE, str(error)) from error
+    return as_gray(pixels)
+
+
+def as_gray(pixels: npt.NDArray[Any]) -> Pixels:
+    """A picture as OpenCV decodes it, as gray, read-only: uint8, of a gray one of 16 bits uint16."""
     if pixels.ndim == 3:
         pixels = cv2.cvtColor(pixels, cv2.COLOR_BGRA2GRAY if pixels.shape[2] == 4 else cv2.COLOR_BGR2GRAY)
-    gray: Image = (pixels >> 8 if pixels.dtype == np.uint16 else pixels).astype(np.uint8, copy=False)
-    gray.flags.writeable = False
-    return gray
+        if pixels.dtype == np.uint16:
+            pixels = np.right_shift(pixels, 8).astype(np.uint8)
+    pixels.flags.writeable = False
+    return pixels
 
 
 def _size_in(header: bytes) -> tuple[int, int] | None:

@@ -13,32 +13,34 @@ import signal
 import threading
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
-from multiprocessing.connection import Connection
+from multiprocessing.connection import Connection, wait
 from multiprocessing.shared_memory import SharedMemory
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Self
+from typing import Any, Literal, Self
 
 import numpy as np
 
 from needletrack.errors import RecordingError
 from needletrack.publish.message import TrackMessage
 from needletrack.recording.mcap_file import About, PairWriter
-from needletrack.records import Image, NeedleTrack, StereoPair
+from needletrack.records import NeedleTrack, Pixels, StereoPair
 
 _log = logging.getLogger(__name__)
 
-# Tracks are small: so many may wait, whatever the pairs do.
-_TRACKS_WAITING = 1024
+# Tracks are small: so many may wait. Pairs wait as long as there is memory for them.
+_MOST_WAITING = 1024
 _STARTED_WITHIN_S = 60.0
 _IDLE_S = 0.5
 _SYNC_EVERY_S = 1.0
 _LOOK_AT_DISK_EVERY_S = 1.0
-_RETRY_AFTER_S = 5.0
+_RETRY_AFTER_S, _RETRY_WITHIN_S = 5.0, 60.0
+_STEADY_AFTER_S = 60.0
+_LOOK_AT_START_EVERY_S = 0.1
 _WARN_EVERY_S = 5.0
 _MB = 1_000_000
 _NICE = -10
@@ -67,7 +69,8 @@ class RecorderSettings:
 class RecorderState:
     """What was recorded so far, by the last that the writing process said.
 
-    error: why it pauses, or None; is_open: whether the file is being written.
+    error: why it pauses, or None; is_open: whether the file is being written; files: how many were begun; kept: of the
+    pairs, those that the kernel has: no end of the writing process takes them away.
     """
 
     file: str = ""
@@ -75,6 +78,8 @@ class RecorderState:
     megabytes: float = 0.0
     error: str | None = None
     is_open: bool = False
+    files: int = 0
+    kept: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,7 +105,7 @@ class _Finish:
 
 @dataclass(frozen=True, slots=True)
 class _Stop:
-    at_s: float
+    pass
 
 
 @dataclass(frozen=True, slots=True)
@@ -111,54 +116,165 @@ class _Freed:
     finished: int = 0
 
 
-class Recorder:
-    """Records pairs and their tracks; `offer` returns at once whatever the disk does, and counts what it cannot take.
+@dataclass(frozen=True, slots=True)
+class _Memory:
+    """Where pairs wait to be written: (slot, camera, row, column)."""
 
-    size_px: of the images. about: what the file says of itself; clock, exposure and place of the stamp are those of the
-    first pair. begun: record from now on, else from `begin`. Raises RecordingError where the folder or file cannot be
-    written.
+    name: str
+    shape: tuple[int, int, int, int]
+    dtype: str
+
+
+_Command = _Pair | _Track | _Finish | _Stop
+
+
+class _Writing:
+    """The process that writes, and the pipes to it and back, which are its own: what it held when it was killed is held
+    for ever. Raises OSError where it cannot be started.
     """
 
     def __init__(
-        self, settings: RecorderSettings, about: About, size_px: tuple[int, int], *, begun: bool = True
+        self,
+        settings: RecorderSettings,
+        about: About,
+        memory: "_Memory",
+        after: RecorderState | None,
+    ) -> None:
+        context = multiprocessing.get_context("spawn")
+        commands, self._commands = context.Pipe(duplex=False)
+        self._answers, answers = context.Pipe(duplex=False)
+        self._process = context.Process(
+            target=_record,
+            args=(settings, about, memory, commands, answers, after),
+            name="needletrack-recorder",
+            daemon=True,
+        )
+        self.started_s = time.monotonic()
+        self._process.start()
+        commands.close()
+        answers.close()
+        self._waiting: queue.SimpleQueue[_Command | None] = queue.SimpleQueue()
+        threading.Thread(target=self._send, name="needletrack-recorder-feed", daemon=True).start()
+
+    @property
+    def pid(self) -> int | None:
+        return self._process.pid
+
+    @property
+    def waiting(self) -> int:
+        """How many commands it has not been given yet."""
+        return self._waiting.qsize()
+
+    @property
+    def is_alive(self) -> bool:
+        return self._process.is_alive()
+
+    @property
+    def failure(self) -> str | None:
+        """How it ended, where that was not as it was told to."""
+        code = self._process.exitcode
+        if not code:
+            return None
+        return f"was killed by {signal.Signals(-code).name}" if code < 0 else f"ended with exit code {code}"
+
+    def first_answer(self, unwanted: threading.Event) -> "_Freed | None":
+        """Wait until it can write, or is not wanted any more; raises RecordingError where it does not come to that."""
+        until_s = time.monotonic() + _STARTED_WITHIN_S
+        while not self._answers.poll(_LOOK_AT_START_EVERY_S):
+            if unwanted.is_set():
+                return None
+            if time.monotonic() > until_s:
+                raise RecordingError("the recording process does not start: is the machine out of memory?")
+        try:
+            answer: _Freed = self._answers.recv()
+        except EOFError:
+            self.wait(1.0)
+            raise RecordingError(f"the recording process {self.failure} as it started") from None
+        return answer
+
+    def put(self, command: _Command) -> None:
+        """Give it something to do, in its turn."""
+        self._waiting.put(command)
+
+    def answers(self, wait_s: float = 0.0) -> "Iterator[_Freed]":
+        """What it has said since; waits so long for the first."""
+        with suppress(EOFError, OSError):
+            while self._answers.poll(wait_s):
+                wait_s = 0.0
+                yield self._answers.recv()
+
+    def wait(self, timeout_s: float | None = None) -> bool:
+        """Wait for its end; whether that came."""
+        return bool(wait([self._process.sentinel], timeout_s))
+
+    def end(self) -> None:
+        """Kill it where it still runs; its last answers can be had yet."""
+        self._process.kill()
+        self._process.join()
+        self._waiting.put(None)
+
+    def close(self) -> None:
+        """End it and forget its answers."""
+        self.end()
+        self._answers.close()
+
+    def _send(self) -> None:
+        """Commands go into a pipe, which is full where it writes more slowly than they come."""
+        with self._commands, suppress(OSError):  # it has ended
+            while (command := self._waiting.get()) is not None:
+                self._commands.send(command)
+
+
+class Recorder:
+    """Records pairs and their tracks; `offer` returns at once whatever the disk does, and counts what it cannot take.
+
+    Where the writing process ends by itself, another one goes on in a new file. size_px: of the images. about: what the
+    file says of itself; clock, exposure and place of the stamp are those of the first pair. bits: of a pixel, as the
+    cameras give them. begun: record from now on, else from `begin`. Raises RecordingError where the folder or file
+    cannot be written.
+    """
+
+    def __init__(
+        self,
+        settings: RecorderSettings,
+        about: About,
+        size_px: tuple[int, int],
+        *,
+        bits: Literal[8, 16] = 8,
+        begun: bool = True,
     ) -> None:
         _require_writable(settings)
-        self._about, self._shape = about, (2, size_px[1], size_px[0])
-        bytes_a_pair = 2 * size_px[0] * size_px[1]
+        self._settings, self._about, self._shape = settings, about, (2, size_px[1], size_px[0])
+        dtype = np.dtype(np.uint8 if bits == 8 else np.uint16)
+        bytes_a_pair = 2 * size_px[0] * size_px[1] * dtype.itemsize
         slots = max(settings.buffer_mb * _MB // bytes_a_pair, 4)
         self._memory = SharedMemory(create=True, size=slots * bytes_a_pair)
-        self._slots: Any = np.ndarray((slots, *self._shape), np.uint8, self._memory.buf)
+        self._slots: Any = np.ndarray((slots, *self._shape), dtype, self._memory.buf)
         self._free = deque(range(slots))
         self._state, self._first, self._warned_s = RecorderState(), True, 0.0
-        # Between the thread that offers and the one that begins and ends; held for an image's copy at most.
+        # Between who offers, who begins and ends, and who keeps the process; held for an image's copy at most.
         self._turn = threading.Lock()
         self._begun, self._ended, self._finished = begun, 0, 0
         # The pairs of this recording: tracks of others do not belong into its file.
         self._first_sequence: int | None = None
         self._last_sequence = self._last_track = -1
         self.offered = self.recorded = self.dropped = self.dropped_tracks = 0
-        context = multiprocessing.get_context("spawn")
-        self._commands: multiprocessing.Queue[_Pair | _Track | _Finish | _Stop] = context.Queue(slots + _TRACKS_WAITING)
-        self._returns, theirs = context.Pipe(duplex=False)
-        self._process = context.Process(
-            target=_record,
-            args=(settings, about, self._memory.name, (slots, *self._shape), self._commands, theirs),
-            name="needletrack-recorder",
-            daemon=True,
-        )
-        self._process.start()
-        theirs.close()
-        self._closed = False
+        self._closed = threading.Event()
+        self._writing: _Writing | None = None
+        self._keeper = threading.Thread(target=self._keep, name="needletrack-recorder-keeper", daemon=True)
         try:
-            self._await_start()
+            self._start(None)
+            if self._state.error is not None:
+                raise RecordingError(self._state.error)
+            self._keeper.start()
         except BaseException:
             self.close(0.0)
             raise
 
     @property
     def pid(self) -> int | None:
-        """The writing process."""
-        return self._process.pid
+        """The writing process, while there is one."""
+        return None if self._writing is None else self._writing.pid
 
     @property
     def state(self) -> RecorderState:
@@ -173,7 +289,7 @@ class Recorder:
     def begin(self, about: About | None = None) -> bool:
         """Record from the next pair on, into a new file; False where it records already. about: of the file."""
         with self._turn:
-            if self._begun or self._closed:
+            if self._begun or self._closed.is_set():
                 return False
             self._about = about or self._about
             self._begun, self._first, self._first_sequence = True, True, None
@@ -186,32 +302,30 @@ class Recorder:
         """
         until_s = time.monotonic() + timeout_s
         with self._turn:
-            if not self._begun or self._closed:
+            if not self._begun or self._closed.is_set():
                 return False
             self._begun = False
-            last, offered = self._last_sequence, self._first_sequence is not None
+            last, offered, writing = self._last_sequence, self._first_sequence is not None, self._writing
         # The last pairs are still with the tracker.
         tracks_until_s = min(time.monotonic() + _TRACKS_FOLLOW_WITHIN_S, until_s)
         while offered and self._last_track < last and time.monotonic() < tracks_until_s:
             time.sleep(_LOOK_EVERY_S)
         with self._turn:
-            if self._closed:
-                return True
             self._ended += 1
             self._first_sequence = None
             wanted = self._ended
             self._finish(wanted)
         while time.monotonic() < until_s:
             with self._turn:
-                if self._closed:
+                if self._closed.is_set():
                     return True
-                self._collect()
+                if writing is None or writing is not self._writing or not writing.is_alive:
+                    raise RecordingError("the recording process has ended: `needletrack recover` saves the file")
+                self._collect(writing)
                 if self._finished >= wanted:
                     if self._state.error is not None:
                         raise RecordingError(self._state.error)
                     return True
-                if not self._process.is_alive():
-                    raise RecordingError("the recorder has ended: `needletrack recover` saves the file")
             time.sleep(_LOOK_EVERY_S)
         raise RecordingError(self._state.error or "the disk is too slow: the file is not finished yet")
 
@@ -223,22 +337,23 @@ class Recorder:
         """
         with self._turn:
             self._about = about
-            if self._begun and not self._closed:
+            if self._begun and not self._closed.is_set():
                 self._first, self._first_sequence = True, None
                 self._ended += 1
                 self._finish(self._ended)
 
     def _finish(self, number: int) -> None:
-        try:
-            self._commands.put_nowait(_Finish(number))
-        except queue.Full as full:
-            raise RecordingError("the disk is too slow: the file is not finished") from full
+        if self._writing is None or self._closed.is_set():
+            return
+        if self._writing.waiting >= _MOST_WAITING:
+            raise RecordingError("the disk is too slow: the file is not finished")
+        self._writing.put(_Finish(number))
 
     def offer(self, pair: StereoPair) -> bool:
         """Take a pair, or count it as dropped: the memory is full, or recording pauses. One thread at a time."""
         with self._turn:
-            if not self._closed:
-                self._collect()
+            if self._writing is not None and not self._closed.is_set():
+                self._collect(self._writing)
             return self._begun and self._taken(pair)
 
     def _taken(self, pair: StereoPair) -> bool:
@@ -246,63 +361,57 @@ class Recorder:
         if self._first_sequence is None:
             self._first_sequence = pair.sequence
         self._last_sequence = pair.sequence
-        fits = pair.left.image.shape == pair.right.image.shape == self._shape[1:]
-        if self._closed or not self._free or not fits or not self._process.is_alive():
+        left, right = pair.left.pixels, pair.right.pixels
+        fits = left.shape == right.shape == self._shape[1:] and left.dtype == right.dtype == self._slots.dtype
+        writing = self._writing if self._writing is not None and self._writing.is_alive else None
+        if writing is None or self._closed.is_set() or not self._free or not fits:
             self.dropped += 1
-            alive = self._process.is_alive()
-            self._warn((self._state.error or "the disk is too slow") if alive else "the recorder has ended")
+            why = "the recording process has ended" if writing is None else "the disk is too slow"
+            self._warn(self._state.error or why)
             return False
         slot = self._free.popleft()
-        np.copyto(self._slots[slot, 0], pair.left.image)
-        np.copyto(self._slots[slot, 1], pair.right.image)
+        np.copyto(self._slots[slot, 0], left)
+        np.copyto(self._slots[slot, 1], right)
         about = None
         if self._first:
             self._first = False
             about = replace(self._about, clock=pair.clock, exposure_ns=pair.exposure_ns, stamp_at=pair.stamp_at)
         stamps = pair.left.captured_at_ns, pair.right.captured_at_ns
-        # There is a place for every slot.
-        self._commands.put_nowait(_Pair(slot, pair.sequence, *stamps, about))
+        writing.put(_Pair(slot, pair.sequence, *stamps, about))
         return True
 
     def take(self, pair: StereoPair, track: NeedleTrack, message: TrackMessage) -> None:
         """Record the message of a pair that was offered to this recording; counts it where there is no place."""
-        first = self._first_sequence
+        first, writing = self._first_sequence, self._writing
         if first is None or not first <= message.sequence <= self._last_sequence:
             return
         self._last_track = message.sequence
-        try:
-            self._commands.put_nowait(_Track(message.sequence, message.captured_at_ns, message.to_json()))
-        except (queue.Full, ValueError):
+        if writing is None or self._closed.is_set() or writing.waiting >= _MOST_WAITING:
             self.dropped_tracks += 1
+            return
+        writing.put(_Track(message.sequence, message.captured_at_ns, message.to_json()))
 
     def close(self, timeout_s: float = 0.7) -> None:
         """Write what waits for at most so long, count the rest as dropped, finish the file; may be called twice."""
         with self._turn:
-            if self._closed:
+            if self._closed.is_set():
                 return
-            self._closed = True
-            with suppress(queue.Full):
-                self._commands.put_nowait(_Stop(time.monotonic() + timeout_s))
-            self._commands.close()
-        until_s = time.monotonic() + timeout_s + 0.2
-        while self._process.is_alive() and time.monotonic() < until_s:
-            # Its answers are taken meanwhile: a full pipe would hold it up.
-            self._collect(0.02)
-        self._collect()
-        if self._process.is_alive():
-            _log.warning(
-                "the recorder did not finish in time: `needletrack recover %s` saves the file", self._state.file
-            )
-            self._process.kill()
-        self._commands.cancel_join_thread()
-        self._process.join()
-        self._collect()
-        waiting = self.offered - self.recorded - self.dropped
-        if waiting > 0:
-            self.dropped += waiting
-            _log.warning("%d pairs were not recorded any more", waiting)
-        self._returns.close()
-        del self._slots
+            self._closed.set()
+            writing = self._writing
+        if writing is not None:
+            writing.put(_Stop())
+            until_s = time.monotonic() + timeout_s + 0.2
+            while not writing.wait(0.0) and time.monotonic() < until_s:
+                # Its answers are taken meanwhile: a full pipe would hold it up.
+                self._collect(writing, 0.02)
+            self._settle(writing)
+            if self._state.is_open:
+                _log.warning(
+                    "the recorder did not finish in time: `needletrack recover %s` saves the file", self._state.file
+                )
+        if self._keeper.ident is not None:
+            self._keeper.join()
+        self._slots = None
         self._memory.close()
         self._memory.unlink()
 
@@ -314,32 +423,93 @@ class Recorder:
     ) -> None:
         self.close()
 
-    def _await_start(self) -> None:
-        if not self._returns.poll(_STARTED_WITHIN_S):
-            raise RecordingError("the recorder did not start: is the machine out of memory?")
-        self._collect()
-        if self._state.error is not None:
-            raise RecordingError(self._state.error)
+    def _start(self, after: RecorderState | None) -> None:
+        """Have a process write, once it can; none where the recorder is closed meanwhile.
 
-    def _collect(self, wait_s: float = 0.0) -> None:
-        with suppress(EOFError, OSError):
-            while self._returns.poll(wait_s):
-                wait_s = 0.0
-                freed: _Freed = self._returns.recv()
-                if freed.state is not None:
-                    self._say(freed.state)
-                self._finished = max(self._finished, freed.finished)
-                if freed.slot >= 0:
-                    self._free.append(freed.slot)
-                    self.recorded += freed.recorded
-                    self.dropped += not freed.recorded
+        after: what the one before said last. Raises RecordingError, OSError.
+        """
+        memory = _Memory(self._memory.name, self._slots.shape, self._slots.dtype.str)
+        writing = _Writing(self._settings, self._about, memory, after)
+        try:
+            answer = writing.first_answer(self._closed)
+        except BaseException:
+            writing.close()
+            raise
+        with self._turn:
+            if answer is None or self._closed.is_set():
+                writing.close()
+                return
+            self._writing, self._first, self._first_sequence = writing, True, None
+            self._account(answer)
+
+    def _keep(self) -> None:
+        """Have another process go on where one has ended by itself, the later the more often that happens."""
+        failures = 0
+        while (writing := self._writing) is not None:
+            writing.wait()
+            with self._turn:
+                if self._closed.is_set():
+                    return
+                failures = 1 if time.monotonic() - writing.started_s > _STEADY_AFTER_S else failures + 1
+                self._say_ended(writing)
+            while self._writing is None:
+                after_s = min(_RETRY_AFTER_S * 2 ** (failures - 2), _RETRY_WITHIN_S) if failures > 1 else 0.0
+                if self._closed.wait(after_s):
+                    return
+                try:
+                    self._start(self._state)
+                except (RecordingError, OSError) as error:
+                    failures += 1
+                    with self._turn:
+                        self._say(replace(self._state, error=f"the recording process cannot be started: {error}"))
+
+    def _say_ended(self, writing: _Writing) -> None:
+        file = self._state.file if self._state.is_open else None
+        self._settle(writing)
+        why = f"the recording process {writing.failure or 'has ended'}: another one is started, with a new file"
+        self._say(replace(self._state, error=why, is_open=False))
+        if file is not None:
+            _log.warning("what is whole of the file that it wrote is saved by `needletrack recover %s`", file)
+
+    def _settle(self, writing: _Writing) -> None:
+        """End a process and count what it takes along: pairs that it had in hand, and those that only it knew of."""
+        writing.end()
+        self._collect(writing)
+        writing.close()
+        state, in_hand = self._state, len(self._slots) - len(self._free)
+        unwritten = state.pairs - state.kept if writing.failure else 0
+        self.recorded -= unwritten
+        self.dropped += in_hand + unwritten
+        if in_hand + unwritten:
+            _log.warning("%d pairs were not recorded any more", in_hand + unwritten)
+        self._state = replace(state, pairs=state.pairs - unwritten)
+        self._free, self._writing = deque(range(len(self._slots))), None
+
+    def _collect(self, writing: _Writing, wait_s: float = 0.0) -> None:
+        for answer in writing.answers(wait_s):
+            self._account(answer)
+
+    def _account(self, freed: "_Freed") -> None:
+        if freed.slot >= 0:
+            self._free.append(freed.slot)
+            self.recorded += freed.recorded
+            self.dropped += not freed.recorded
+        if freed.state is not None:
+            # An error of the disk takes along what was recorded, but not with the kernel yet.
+            lost = self.recorded - freed.state.pairs
+            self.recorded -= lost
+            self.dropped += lost
+            self._say(freed.state)
+        self._finished = max(self._finished, freed.finished)
 
     def _say(self, state: RecorderState) -> None:
         if state.error != self._state.error:
             if state.error is not None:
                 _log.warning("recording pauses: %s", state.error)
             else:
-                _log.warning("recording goes on: %s", state.file)
+                _log.warning(
+                    "recording goes on: %s", state.file if state.is_open else "the next pair begins a new file"
+                )
         self._state = state
 
     def _warn(self, why: str) -> None:
@@ -367,10 +537,10 @@ def _require_writable(settings: RecorderSettings) -> None:
 def _record(
     settings: RecorderSettings,
     about: About,
-    memory_name: str,
-    shape: tuple[int, ...],
-    commands: "multiprocessing.Queue[_Pair | _Track | _Finish | _Stop]",
-    returns: Connection,
+    memory: _Memory,
+    commands: Connection,
+    answers: Connection,
+    after: RecorderState | None,
 ) -> None:
     """The writing process."""
     # Ctrl-C and a stop of the service reach it as well: it ends when it is told, or its parent is gone.
@@ -382,44 +552,50 @@ def _record(
     with suppress(OSError):
         os.nice(_NICE)
     _keep_freed_memory()
-    memory = SharedMemory(memory_name)
-    slots: Any = np.ndarray(shape, np.uint8, memory.buf)
-    files = _Files(settings, about)
+    shared = SharedMemory(memory.name)
+    slots: Any = np.ndarray(memory.shape, memory.dtype, shared.buf)
+    files = _Files(settings, about, after)
     files.probe()
-    returns.send(_Freed(-1, recorded=False, state=files.state))
-    parent = os.getppid()
-    stop_at_s: float | None = None
+    told = files.state
+
+    def tell(slot: int = -1, *, recorded: bool = False, finished: int = 0) -> None:
+        nonlocal told
+        state, told = files.state if files.state != told else None, files.state
+        with suppress(BrokenPipeError):
+            answers.send(_Freed(slot, recorded, state, finished))
+
+    answers.send(_Freed(-1, recorded=False, state=files.state))
     try:
-        while stop_at_s is None or time.monotonic() < stop_at_s:
-            try:
-                command = commands.get(timeout=_IDLE_S if stop_at_s is None else 0.01)
-            except queue.Empty:
-                if stop_at_s is not None:
-                    break
+        while not isinstance(command := _next(commands), _Stop):
+            if command is None:
                 files.idle()
-                if os.getppid() != parent:
-                    break  # killed: what came is finished
-                continue
-            if isinstance(command, _Stop):
-                stop_at_s = command.at_s
             elif isinstance(command, _Track):
                 files.add_track(command)
             elif isinstance(command, _Finish):
                 files.end()
-                with suppress(BrokenPipeError):
-                    returns.send(_Freed(-1, recorded=False, state=files.state, finished=command.number))
+                tell(finished=command.number)
             else:
-                before = files.state
                 recorded = files.add_pair(command, slots[command.slot, 0], slots[command.slot, 1])
-                with suppress(BrokenPipeError):
-                    returns.send(_Freed(command.slot, recorded, files.state if files.state != before else None))
+                tell(command.slot, recorded=recorded)
+            if files.state.kept != told.kept:
+                tell()
         files.finish()
-        with suppress(BrokenPipeError):
-            returns.send(_Freed(-1, recorded=False, state=files.state))
+        tell()
     finally:
         del slots
         with suppress(BufferError):
-            memory.close()
+            shared.close()
+
+
+def _next(commands: Connection) -> _Command | None:
+    """What is to be done next, in the order in which it was given; None where nothing has come for a while."""
+    try:
+        if not commands.poll(_IDLE_S):
+            return None
+        command: _Command = commands.recv()
+    except (EOFError, OSError):
+        return _Stop()  # the daemon was killed: what came is finished
+    return command
 
 
 def _keep_freed_memory() -> None:
@@ -433,15 +609,15 @@ def _keep_freed_memory() -> None:
 class _Files:
     """One file after another; an error of the disk pauses the recording, which is tried again."""
 
-    def __init__(self, settings: RecorderSettings, about: About) -> None:
+    def __init__(self, settings: RecorderSettings, about: About, after: RecorderState | None = None) -> None:
         self._settings, self._about = settings, about
         self._writer: PairWriter | None = None
-        self._number = 0
+        self._is_first = after is None
+        self.state = RecorderState() if after is None else replace(after, error=None, is_open=False)
+        self._number = self.state.files
         self._retry_at_s = self._looked_at_s = self._synced_at_s = 0.0
         self._syncing: threading.Thread | None = None
-        self._done = 0
-        self._bytes_done = 0
-        self.state = RecorderState()
+        self._done = self._bytes_done = 0
 
     def probe(self) -> None:
         """Say in `state` what keeps the first file from being written; leaves nothing behind."""
@@ -456,7 +632,7 @@ class _Files:
         except OSError as error:
             self._pause(_unwritable(folder, error))
 
-    def add_pair(self, command: _Pair, left: Image, right: Image) -> bool:
+    def add_pair(self, command: _Pair, left: Pixels, right: Pixels) -> bool:
         if command.about is not None:
             self._about = command.about
         return self._attempt(
@@ -480,8 +656,7 @@ class _Files:
             self._count()
             self.state = replace(self.state, is_open=False)
         except OSError as error:
-            self._writer.abandon()
-            self._pause(_unwritable(self._writer.path, error))
+            self._abandon(self._writer, error)
         self._writer = None
 
     def end(self) -> None:
@@ -515,19 +690,34 @@ class _Files:
             return False
         except OSError as error:
             if self._writer is not None:
-                self._writer.abandon()
+                self._abandon(self._writer, error)
                 self._writer = None
-            self._pause(_unwritable(path, error))
+            else:
+                self._pause(_unwritable(path, error))
             return False
         self._count()
         if self._writer.bytes_written > self._settings.max_file_mb * _MB:
             self.finish()
         return True
 
+    def _abandon(self, writer: PairWriter, error: OSError) -> None:
+        """What the kernel has not got is lost."""
+        writer.abandon()
+        kept = self._done + writer.kept
+        self.state = replace(self.state, pairs=kept, kept=kept)
+        self._pause(_unwritable(writer.path, error))
+
     def _count(self) -> None:
         assert self._writer is not None
-        pairs, size = self._done + self._writer.pairs, self._bytes_done + self._writer_bytes()
-        self.state = RecorderState(str(self._writer.path), pairs, round(size / _MB, 1), is_open=True)
+        writer, size = self._writer, self._bytes_done + self._writer_bytes()
+        self.state = RecorderState(
+            str(writer.path),
+            self._done + writer.pairs,
+            round(size / _MB, 1),
+            is_open=True,
+            files=self._number,
+            kept=self._done + writer.kept,
+        )
 
     def _writer_bytes(self) -> int:
         assert self._writer is not None
@@ -552,7 +742,14 @@ class _Files:
     def _next_path(self) -> Path:
         if self._writer is None and self._number:
             self._done, self._bytes_done = self.state.pairs, round(self.state.megabytes * _MB)
-        number, self._number = self._number, self._number + 1
+        while True:
+            number, self._number = self._number, self._number + 1
+            path = self._path(number)
+            # One that was killed may have begun another file and not have said so.
+            if self._is_first or not path.exists():
+                return path
+
+    def _path(self, number: int) -> Path:
         if self._settings.file is not None:
             file = self._settings.file
             return file if number == 0 else file.with_name(f"{file.stem}-{number}{file.suffix}")

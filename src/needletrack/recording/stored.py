@@ -86,7 +86,7 @@ def write_asl(recording: StoredRecording, output: Path, *, with_rig: bool = True
                 continue
             for number, frame in enumerate((pair.left, pair.right)):
                 file = output / f"cam{number}" / "data" / f"{frame.captured_at_ns}.png"
-                whole, data = cv2.imencode(".png", frame.image, [cv2.IMWRITE_PNG_COMPRESSION, 1])
+                whole, data = cv2.imencode(".png", frame.pixels, [cv2.IMWRITE_PNG_COMPRESSION, 1])
                 assert whole
                 file.write_bytes(data.tobytes())
                 listings[number].append(f"{frame.captured_at_ns},{file.name}\n")

@@ -167,6 +167,25 @@ def test_a_reader_that_is_too_slow_loses_the_oldest_and_knows_it(endpoint: str) 
         assert second.missed == Missed()
 
 
+@pytest.mark.parametrize("capacity", [1, 3])
+def test_a_reader_that_looks_but_takes_too_slowly_is_told_of_every_track_it_missed(
+    endpoint: str, capacity: int
+) -> None:
+    """`health` and `latest` decode what came: tracks overflow behind them, too."""
+    with daemon(endpoint) as publisher, patient([endpoint], capacity=capacity) as subscriber:
+        assert publisher.wait_for_subscriber(WAIT_S)
+        publisher.publish(message(0))
+        assert taken(subscriber).message.sequence == 0
+        for sequence in (1, 2, 3, 6, 7, 8, 9):
+            publisher.publish(message(sequence, dropped={DropReason.OVERWRITTEN: 2 if sequence > 3 else 0}))
+            assert eventually(partial(has_latest, subscriber, sequence))
+        received = [taken(subscriber) for _ in range(capacity)]
+        assert [one.message.sequence for one in received] == [7, 8, 9][-capacity:]
+        assert received[0].missed == Missed(dropped=2, overflowed=7 - capacity)
+        assert all(one.missed == Missed() for one in received[1:])
+        assert subscriber.overflowed == 7 - capacity
+
+
 def test_only_looking_at_the_latest_loses_no_count(endpoint: str) -> None:
     with daemon(endpoint) as publisher, patient([endpoint], capacity=2) as subscriber:
         assert publisher.wait_for_subscriber(WAIT_S)

@@ -10,7 +10,7 @@ import weakref
 from collections import deque
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, NamedTuple, Self
@@ -127,6 +127,10 @@ class Missed:
     dropped: int = 0
     lost: int = 0
     overflowed: int = 0
+
+    def after(self, gone: "Missed") -> "Missed":
+        """The same, where the track before was dropped here, which missed some itself."""
+        return Missed(self.dropped + gone.dropped, self.lost + gone.lost, self.overflowed + gone.overflowed + 1)
 
 
 @dataclass(frozen=True, slots=True)
@@ -485,14 +489,23 @@ class Subscriber:
             if self._last_track_ns is not None:
                 self._periods_s.append((sample.received_monotonic_ns - self._last_track_ns) / 1e9)
             self._last_track_ns = sample.received_monotonic_ns
-            if len(self._queue) == self._queue.maxlen:
-                self._overflowed += 1
-            self._queue.append(received)
+            self._enqueue(received)
             self._latest = received
             decoded = True
         if decoded:
             self._changed.notify_all()
         return decoded
+
+    def _enqueue(self, received: Received) -> None:
+        """Keep a track for `next`; the oldest makes room, and what follows it tells what it would have told."""
+        gone = self._queue.popleft() if len(self._queue) == self._queue.maxlen else None
+        self._queue.append(received)
+        if gone is None:
+            return
+        self._overflowed += 1
+        head = self._queue[0]
+        if head.message.run_id == gone.message.run_id:
+            self._queue[0] = replace(head, missed=head.missed.after(gone.missed))
 
     def _unreadable(self, reason: str) -> None:
         self._undecodable += 1

@@ -520,3 +520,27 @@ def test_a_program_that_closes_nothing_ends_all_the_same(endpoint: str, left_ope
         f"e = sys.argv[1]; left_open = {left_open}"
     )
     assert subprocess.run([sys.executable, "-c", program, endpoint], timeout=30, check=False).returncode == 0
+
+
+@pytest.mark.parametrize("closing", ["", "subscriber.close()"])
+def test_a_program_ends_in_order_while_its_router_hangs(closing: str) -> None:
+    """A router that takes the connection and says nothing: Zenoh waits in a thread as the interpreter ends."""
+    code = f"""
+import sys, time
+from needletrack.client import Freshness, Subscriber
+from needletrack.publish import session
+session.OPEN_WITHIN_MS = 500
+
+class EndsSlowly:
+    def __del__(self, sleep=time.sleep):
+        sleep(1.0)
+
+something = EndsSlowly()
+subscriber = Subscriber("lab", [sys.argv[1]], mode="client")
+assert subscriber.health.state is Freshness.NEVER_SEEN
+{closing}
+"""
+    with socket.create_server(("127.0.0.1", 0)) as hung:
+        endpoint = f"tcp/127.0.0.1:{hung.getsockname()[1]}"
+        done = subprocess.run([sys.executable, "-c", code, endpoint], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (0, "")

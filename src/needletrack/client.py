@@ -3,6 +3,7 @@
 docs/wire.md shows a control loop.
 """
 
+import atexit
 import statistics
 import threading
 import time
@@ -250,7 +251,10 @@ class Subscriber:
         try:
             self._open(opened)
         except NobodyAnswers:
-            threading.Thread(target=self._open_when_answered, args=(opened,), daemon=True).start()
+            opening = threading.Thread(target=self._open_when_answered, args=(opened,), daemon=True)
+            # A thread inside Zenoh while the interpreter ends would abort the process.
+            atexit.register(self._give_up, opening)
+            opening.start()
 
     @classmethod
     def configured(cls, rig: str, settings: "SubscribingConfig", **options: Any) -> Self:
@@ -295,16 +299,26 @@ class Subscriber:
             opened.close()
 
     def _open_when_answered(self, opened: ExitStack) -> None:
-        while not self._closed:
-            try:
-                self._open(opened)
-            except NobodyAnswers:
-                time.sleep(CLIENT_TRIES_EVERY_S)
-            except PublishError as error:  # told by `health`, and by who waits for the daemon
-                self._why_not_open = str(error)
-                return
-            else:
-                return
+        try:
+            while not self._closed:
+                try:
+                    self._open(opened)
+                except NobodyAnswers:
+                    with self._changed:
+                        self._changed.wait_for(lambda: self._closed, CLIENT_TRIES_EVERY_S)
+                except PublishError as error:  # told by `health`, and by who waits for the daemon
+                    self._why_not_open = str(error)
+                    return
+                else:
+                    return
+        finally:
+            atexit.unregister(self._give_up)
+
+    def _give_up(self, opening: threading.Thread) -> None:
+        with self._changed:
+            self._closed = True
+            self._changed.notify_all()
+        opening.join()
 
     def __enter__(self) -> Self:
         return self

@@ -278,6 +278,14 @@ def fresh(watcher: Watcher) -> None:
     watcher.fresh_after(time.monotonic())
 
 
+def routing(router: Child) -> float:
+    """Wait until a router takes connections; when it did."""
+    assert router.process.stdout is not None
+    if router.process.stdout.readline() != "routing\n":
+        raise Missed(f"the router ended: {router.stderr()[-500:]}")
+    return time.monotonic()
+
+
 def ended(child: Child, timeout_s: float = WAIT_S) -> int:
     """A child's exit code, once it has ended."""
     return child.process.wait(timeout_s)

@@ -61,7 +61,7 @@ def update(page: Path, lines: list[str], loads: list[float]) -> None:
     """Put the table between the marks of a page."""
     table = _HEAD + "\n".join(lines)
     here = Machine.here()
-    when = f"{datetime.now(UTC):%Y-%m-%d} on {here.cores_usable} cores ({here.cpu}), {here.system.split('-with')[0]}"
+    when = f"{datetime.now(UTC):%Y-%m-%d} on {here.cores_usable} cores ({here.cpu}), {here.system}"
     when += f". A minute's load was {loads[0]:.1f} before and {max(loads):.1f} at most, the rows' own included"
     text = page.read_text(encoding="utf-8")
     inside = f"{BEGIN}\nMeasured {when}.\n\n{table}\n{END}"

@@ -297,7 +297,7 @@ def _tell(transits_ms: list[float], lost: int) -> None:
     print(json.dumps(answer), flush=True)
 
 
-def stand_by(role: str, tracks: str, frames: str) -> None:
+def stand_by(role: str, tracks: str, frames: str, rig: str, slow_s: float) -> None:
     """Another subscriber; slow ones hold up Zenoh's own thread."""
     import zenoh
 
@@ -319,9 +319,9 @@ def stand_by(role: str, tracks: str, frames: str) -> None:
         def take(sample: zenoh.Sample) -> None:
             linked.set()
             if "slow" in role:
-                time.sleep(SLOW_S)
+                time.sleep(slow_s)
 
-        key = f"needletrack/{RIG}/{'overlay' if 'frames' in role else 'track'}"
+        key = f"needletrack/{rig}/{'overlay' if 'frames' in role else 'track'}"
         session.declare_subscriber(key, zenoh.handlers.Callback(take, indirect=False))
         while not session.info.transports():
             time.sleep(0.02)
@@ -361,6 +361,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("endpoints", nargs="*", help=argparse.SUPPRESS)
     parser.add_argument("--role", help=argparse.SUPPRESS)
     parser.add_argument("--frames", default="", help=argparse.SUPPRESS)
+    parser.add_argument("--rig", default=RIG, help=argparse.SUPPRESS)
+    parser.add_argument("--slow-s", type=float, default=SLOW_S, help=argparse.SUPPRESS)
     parser.add_argument("--not-express", action="store_true", help=argparse.SUPPRESS)
     parser.add_argument("--rate", type=float, default=100.0, help="tracks a second")
     parser.add_argument("--seconds", type=float, default=5.0, help="of each case and round")
@@ -378,7 +380,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         elif asked.role == "measure-both":
             measure_beside_frames(tracks, asked.rate)
         else:
-            stand_by(asked.role, tracks, frames)
+            stand_by(asked.role, tracks, frames, asked.rig, asked.slow_s)
         return 0
     met, fifo = True, may_schedule(PRIORITY)
     scheduled = "SCHED_FIFO, so that other jobs here count less" if fifo else "ordinary scheduling"

@@ -2,6 +2,7 @@
 
 import os
 import platform
+import re
 import subprocess
 from collections.abc import Mapping
 from datetime import UTC, datetime
@@ -47,7 +48,7 @@ class Machine(BaseModel):
             cores=psutil.cpu_count() or 1,
             cores_usable=len(os.sched_getaffinity(0)),
             memory_mb=round(psutil.virtual_memory().total / 1e6),
-            system=platform.platform(),
+            system=_system(),
             python=platform.python_version(),
             libraries={name: version(name) for name in LIBRARIES},
             threads=thread_counts(),
@@ -76,6 +77,12 @@ def stem(machine: Machine, started_at: str) -> str:
     """What a run's record is called: commit and time."""
     commit = (machine.commit or "uncommitted")[:12] + ("-changed" if machine.dirty else "")
     return f"{commit}-{started_at[:19].replace(':', '').replace('-', '')}"
+
+
+def _system() -> str:
+    """`Linux 6.18`: what follows in a kernel's release names its builder and the machine."""
+    numbers = re.match(r"\d+(\.\d+)?", platform.release())
+    return f"{platform.system()} {numbers[0] if numbers else ''}".strip()
 
 
 def _cpu() -> str:

@@ -14,8 +14,17 @@ from typing import Any
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
-from needletrack.client import Freshness, Missed, Received, Subscriber
+from needletrack.client import (
+    PERIODS_REMEMBERED,
+    SILENT_PERIODS,
+    Freshness,
+    Missed,
+    Received,
+    Subscriber,
+    usual_period_s,
+)
 from needletrack.errors import PublishError
 from needletrack.publish import publisher as publisher_module
 from needletrack.publish.message import Instant, RunContext, Source, StatusMessage, TrackMessage
@@ -25,6 +34,7 @@ from needletrack.publish.session import open_session
 from needletrack.records import Clock, DropReason, Frame, NeedleTrack, Reason, Status, StereoPair
 
 WAIT_S = 10.0
+Floats = NDArray[np.float64]
 
 
 @pytest.fixture
@@ -165,6 +175,25 @@ def test_a_reader_that_is_too_slow_loses_the_oldest_and_knows_it(endpoint: str) 
         assert (first.message.sequence, second.message.sequence) == (6, 7)
         assert first.missed == Missed(dropped=2, overflowed=3)
         assert second.missed == Missed()
+
+
+@pytest.mark.parametrize("capacity", [1, 3])
+def test_a_reader_that_looks_but_takes_too_slowly_is_told_of_every_track_it_missed(
+    endpoint: str, capacity: int
+) -> None:
+    """`health` and `latest` decode what came: tracks overflow behind them, too."""
+    with daemon(endpoint) as publisher, patient([endpoint], capacity=capacity) as subscriber:
+        assert publisher.wait_for_subscriber(WAIT_S)
+        publisher.publish(message(0))
+        assert taken(subscriber).message.sequence == 0
+        for sequence in (1, 2, 3, 6, 7, 8, 9):
+            publisher.publish(message(sequence, dropped={DropReason.OVERWRITTEN: 2 if sequence > 3 else 0}))
+            assert eventually(partial(has_latest, subscriber, sequence))
+        received = [taken(subscriber) for _ in range(capacity)]
+        assert [one.message.sequence for one in received] == [7, 8, 9][-capacity:]
+        assert received[0].missed == Missed(dropped=2, overflowed=7 - capacity)
+        assert all(one.missed == Missed() for one in received[1:])
+        assert subscriber.overflowed == 7 - capacity
 
 
 def test_only_looking_at_the_latest_loses_no_count(endpoint: str) -> None:
@@ -501,3 +530,59 @@ def test_a_program_that_closes_nothing_ends_all_the_same(endpoint: str, left_ope
         f"e = sys.argv[1]; left_open = {left_open}"
     )
     assert subprocess.run([sys.executable, "-c", program, endpoint], timeout=30, check=False).returncode == 0
+
+
+def late_by_chance(due_s: Floats, random: np.random.Generator) -> Floats:
+    """As on a busy machine: in order, some later than they should, those behind them sooner after."""
+    return np.maximum.accumulate(due_s + random.exponential(0.010, len(due_s)))
+
+
+def two_at_a_time(due_s: Floats, random: np.random.Generator) -> Floats:
+    held = np.arange(len(due_s)) // 2 * 2 + 1
+    return due_s[np.minimum(held, len(due_s) - 1)]
+
+
+def after_two_gaps(due_s: Floats, random: np.random.Generator) -> Floats:
+    gaps = np.zeros(len(due_s))
+    gaps[random.choice(np.arange(1, len(due_s)), 2, replace=False)] = 0.05
+    return due_s + np.cumsum(gaps)
+
+
+@pytest.mark.parametrize("arrive", [late_by_chance, two_at_a_time, after_two_gaps])
+def test_silence_is_noticed_in_time_whatever_the_pace_of_this_machine(
+    arrive: Callable[[Floats, np.random.Generator], Floats],
+) -> None:
+    """At 60 Hz within 100 ms, and not as soon as one track is late."""
+    random = np.random.default_rng(5)
+    for _ in range(200):
+        came_s = arrive(np.arange(PERIODS_REMEMBERED + 1) / 60, random)
+        assert 0.06 < SILENT_PERIODS * usual_period_s(np.diff(came_s).tolist()) < 0.1
+
+
+def test_of_few_tracks_the_usual_period_is_the_median() -> None:
+    assert usual_period_s([0.5]) == 0.5
+    assert usual_period_s([0.5, 0.02, 0.02]) == 0.02
+
+
+@pytest.mark.parametrize("closing", ["", "subscriber.close()"])
+def test_a_program_ends_in_order_while_its_router_hangs(closing: str) -> None:
+    """A router that takes the connection and says nothing: Zenoh waits in a thread as the interpreter ends."""
+    code = f"""
+import sys, time
+from needletrack.client import Freshness, Subscriber
+from needletrack.publish import session
+session.OPEN_WITHIN_MS = 500
+
+class EndsSlowly:
+    def __del__(self, sleep=time.sleep):
+        sleep(1.0)
+
+something = EndsSlowly()
+subscriber = Subscriber("lab", [sys.argv[1]], mode="client")
+assert subscriber.health.state is Freshness.NEVER_SEEN
+{closing}
+"""
+    with socket.create_server(("127.0.0.1", 0)) as hung:
+        endpoint = f"tcp/127.0.0.1:{hung.getsockname()[1]}"
+        done = subprocess.run([sys.executable, "-c", code, endpoint], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (0, "")

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 from tests.capture.fake_kernel import MONOTONIC, FakeCamera, RunningKernel, two_cameras
 from tests.daemon.test_run import config_for, free_port
-from tests.recording.small_recording import SIZE_PX, small_rig
+from tests.recording.small_recording import SIZE_PX, own_rig
 from typer.testing import CliRunner
 
 from needletrack import doctor
@@ -31,7 +31,7 @@ def _small_disk_test(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def calibrated(days_ago: float = 1) -> Rig:
     info = CalibrationInfo(calibrated_at=datetime.now(UTC) - timedelta(days=days_ago), reprojection_rms_px=0.1)
-    return replace(small_rig(), calibration=info)
+    return replace(own_rig(), calibration=info)
 
 
 def examined(
@@ -71,7 +71,7 @@ def test_a_rig_that_is_well(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("changes", "subject", "verdict", "remedy"),
     [
-        ({"rig": small_rig()}, "rig", Verdict.WARN, "calibrate anew"),
+        ({"rig": own_rig()}, "rig", Verdict.WARN, "calibrate anew"),
         ({"rig": calibrated(90)}, "rig", Verdict.WARN, "calibrate anew"),
         ({"picture": b"\xff" * len(GRAY)}, "exposure", Verdict.WARN, "shorten"),
         ({"picture": b"\x05" * len(GRAY)}, "exposure", Verdict.WARN, "more light"),
@@ -120,7 +120,7 @@ def test_a_camera_that_sends_nothing(tmp_path: Path) -> None:
 
 
 def test_a_daemon_that_runs_keeps_its_cameras(tmp_path: Path) -> None:
-    with OnlyInstance("small"):
+    with OnlyInstance(own_rig().name):
         found = examined(tmp_path)
     assert found["daemon"].verdict is Verdict.WARN
     assert "left camera" not in found
@@ -141,7 +141,7 @@ def test_without_a_rig_the_rest_is_looked_at(tmp_path: Path) -> None:
     def no_rig() -> Rig:
         raise CalibrationError("rig.yaml: cannot read the calibration")
 
-    config = config_for(small_rig(), recording={"folder": tmp_path})
+    config = config_for(own_rig(), recording={"folder": tmp_path})
     kernel = RunningKernel(two_cameras(SIZE_PX), lambda number: (GRAY, GRAY))
     found = list(examine(config, no_rig, seconds=0.2, kernel=kernel))
     assert found[0].verdict is Verdict.FAIL

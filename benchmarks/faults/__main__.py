@@ -1,4 +1,4 @@
-"""The fault table: python -m benchmarks.faults [--update docs/reliability.md] [NAME ...]; `make faults`."""
+"""The fault table: python -m benchmarks.faults [--update docs/reliability.md | NAME ...]; `make faults`."""
 
 import argparse
 import os
@@ -9,11 +9,13 @@ import traceback
 from datetime import UTC, datetime
 from pathlib import Path
 
-from benchmarks.faults.rows import FAULTS, Fault, NotHere, Seen
+from benchmarks.faults import commands, intruders, network, rows
 from benchmarks.faults.stage import Stage
+from benchmarks.faults.table import Fault, NotHere, Seen
 from benchmarks.machine import Machine
 
 BEGIN, END = "<!-- faults: begin -->", "<!-- faults: end -->"
+FAULTS = (*rows.FAULTS, *network.FAULTS, *intruders.FAULTS, *commands.FAULTS)
 _HEAD = "| fault | injected | the subscriber saw | healthy after | lost |\n|---|---|---|---|---|\n"
 
 
@@ -30,6 +32,8 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("names", nargs="*", help="rows or groups; without any: all")
     parser.add_argument("--update", type=Path, help="write the table into this page, between its marks")
     asked = parser.parse_args(arguments)
+    if asked.update is not None and asked.names:
+        parser.error("--update writes the whole table: leave out the names")
     chosen = [each for each in FAULTS if not asked.names or each.group in asked.names or each.name in asked.names]
     lines, failed = [], []
     loads = [os.getloadavg()[0]]
@@ -57,7 +61,7 @@ def update(page: Path, lines: list[str], loads: list[float]) -> None:
     """Put the table between the marks of a page."""
     table = _HEAD + "\n".join(lines)
     here = Machine.here()
-    when = f"{datetime.now(UTC):%Y-%m-%d} on {here.cores_usable} cores ({here.cpu}), {here.system.split('-with')[0]}"
+    when = f"{datetime.now(UTC):%Y-%m-%d} on {here.cores_usable} cores ({here.cpu}), {here.system}"
     when += f". A minute's load was {loads[0]:.1f} before and {max(loads):.1f} at most, the rows' own included"
     text = page.read_text(encoding="utf-8")
     inside = f"{BEGIN}\nMeasured {when}.\n\n{table}\n{END}"

@@ -24,6 +24,7 @@ from needletrack.terminal import Interruption
 RATE_HZ = 10.0
 _PAIRS = 20
 HEARTBEAT_S = 0.1
+_TLS_FILES = ("authority", "certificate", "key")
 
 
 class Cameras(RunningKernel):
@@ -94,7 +95,11 @@ def main() -> int:
     )
     parser.add_argument("--listen", action="append", default=[])
     parser.add_argument("--connect", action="append", default=[])
+    parser.add_argument("--tls", type=Path, help="folder of authority, certificate and key")
     parser.add_argument("--record", type=Path)
+    parser.add_argument("--idle", action="store_true", help="record on command only")
+    parser.add_argument("--control", action="store_true", help="take commands")
+    parser.add_argument("--token", type=Path, help="file of the secret that a command bears")
     parser.add_argument("--min-free-mb", type=int, default=0)
     parser.add_argument("--absent", action="store_true", help="no camera is there at the start")
     parser.add_argument("--forbidden", action="store_true", help="the cameras may not be opened")
@@ -107,6 +112,7 @@ def main() -> int:
         if asked.other_format:
             camera.formats = {"YUYV": camera.formats["GREY"]}
             camera.reset()
+    files = {} if asked.tls is None else {what: asked.tls / f"{what}.pem" for what in _TLS_FILES}
     config = Config.model_validate(
         {
             "cameras": {
@@ -115,8 +121,19 @@ def main() -> int:
                 "left": {"id": "usb-1"},
                 "right": {"id": "usb-2"},
             },
-            "publishing": {"listen": asked.listen, "connect": asked.connect, "heartbeat_s": HEARTBEAT_S},
-            "recording": {"folder": asked.record, "buffer_mb": 64, "min_free_mb": asked.min_free_mb},
+            "publishing": {
+                "listen": asked.listen,
+                "connect": asked.connect,
+                "heartbeat_s": HEARTBEAT_S,
+                "tls": files,
+            },
+            "recording": {
+                "folder": asked.record,
+                "buffer_mb": 64,
+                "min_free_mb": asked.min_free_mb,
+                "at_start": not asked.idle,
+            },
+            "control": {"enabled": asked.control, "token_file": asked.token},
             "daemon": {"metrics_port": 0, "realtime_priority": 0, "lock_memory": False},
         }
     )

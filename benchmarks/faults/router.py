@@ -21,6 +21,7 @@ def main() -> int:
     for key, value in settings.items():
         config.insert_json5(key, json.dumps(value))
     with zenoh.open(config):
+        print("routing", flush=True)
         signal.pause()
     return 0
 

@@ -1,4 +1,4 @@
-"""The faults: each a small function that injects one and says what the subscriber saw of it."""
+"""Faults of the daemon, its cameras and its disk: each a small function that injects one and says what was seen."""
 
 import errno
 import os
@@ -6,81 +6,32 @@ import resource
 import signal
 import subprocess
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
 import psutil
 
-from benchmarks.faults.stage import Child, Link, Missed, Stage, Watcher, ended, fresh, said_last, until
-from benchmarks.loopback import free_endpoint
+from benchmarks.faults.stage import Child, Stage, Watcher, ended, said_last, until
+from benchmarks.faults.table import (
+    NOTHING,
+    Faults,
+    NotHere,
+    Seen,
+    change,
+    changes,
+    counted,
+    lost,
+    require,
+    short,
+    silence,
+)
 from needletrack.capture.v4l2_abi import Request
 from needletrack.daemon.run import ExitCode
-from needletrack.publish.session import MOST_RECEIVED_BYTES, open_session
 from needletrack.recording.mcap_file import McapRecording, recover
 
-
-@dataclass(frozen=True)
-class Seen:
-    """What came of a fault: what the subscriber saw, seconds until healthy once its cause was gone, what was lost."""
-
-    saw: str
-    healthy_s: float | None
-    lost: str
-
-
-@dataclass(frozen=True)
-class Fault:
-    """A row of the table."""
-
-    group: str
-    name: str
-    injected: str
-    run: Callable[[Stage], Seen]
-
-
-FAULTS: list[Fault] = []
-NOTHING = "nothing"
-
-
-def fault(group: str, name: str, injected: str) -> Callable[[Callable[[Stage], Seen]], Callable[[Stage], Seen]]:
-    """Add a function to the table."""
-
-    def add(run: Callable[[Stage], Seen]) -> Callable[[Stage], Seen]:
-        FAULTS.append(Fault(group, name, injected, run))
-        return run
-
-    return add
-
-
-def _change(watcher: Watcher, at_s: float, *states: str) -> str:
-    """`gone after 0.01 s`."""
-    seen = watcher.health(at_s, *states)
-    return f"{seen['health']} after {max(seen['at_s'] - at_s, 0):.2f} s"
-
-
-def _lost(watcher: Watcher, since_s: float) -> str:
-    """What its tracks since a moment say of those between them."""
-    dropped, lost, overflowed = watcher.missed(since_s)
-    parts = [f"{dropped} pairs dropped" * bool(dropped), f"{lost} tracks lost on the way" * bool(lost)]
-    parts.append(f"{overflowed} overflowed in the subscriber" * bool(overflowed))
-    return ", ".join(part for part in parts if part) or NOTHING
-
-
-def _counted(watcher: Watcher, before: dict[str, int]) -> str:
-    """By how much the daemon's own counts grew."""
-    now = watcher.drops()
-    grown = {reason: now[reason] - before.get(reason, 0) for reason in now if now[reason] != before.get(reason, 0)}
-    return "counted: " + (", ".join(f"{reason} {count}" for reason, count in sorted(grown.items())) or NOTHING)
-
-
-def _silence(watcher: Watcher, since_s: float) -> float:
-    """The longest time without a track since a moment."""
-    times = [since_s, *(seen["at_s"] for seen in watcher.since(since_s, "track"))]
-    return max((float(gap) for gap in np.diff(times)), default=0.0)
-
+FAULTS = Faults()
+fault = FAULTS.row
 
 # --- the daemon
 
@@ -90,9 +41,9 @@ def killed(stage: Stage) -> Seen:
     """Nothing of it runs on: neither its recorder, nor what audits its tracks, nor memory that they shared."""
     daemon, watcher = stage.running("--record", str(stage.folder))
     family, memory = daemon.family(), _shared_memory(daemon)
-    _require(len(memory) == 2 and daemon.recorder() != daemon.auditor(), "it has not both of its processes")
+    require(len(memory) == 2 and daemon.recorder() != daemon.auditor(), "it has not both of its processes")
     at_s = daemon.signal(signal.SIGKILL)
-    saw = _change(watcher, at_s, "gone")
+    saw = change(watcher, at_s, "gone")
     ended(daemon)
     until(lambda: not any(_runs(process) for process in family), "the end of every process of the daemon", 5.0)
     saw += f"; none of its {len(family)} other processes after {time.monotonic() - at_s:.2f} s"
@@ -110,7 +61,7 @@ def terminated(stage: Stage) -> Seen:
     at_s = daemon.signal(signal.SIGTERM)
     code = ended(daemon)
     took_s = time.monotonic() - at_s
-    saw = f"state stopping, {_change(watcher, at_s, 'gone')}; exit code {code} after {took_s:.2f} s"
+    saw = f"state stopping, {change(watcher, at_s, 'gone')}; exit code {code} after {took_s:.2f} s"
     watcher.heartbeat(at_s, lambda beat: beat["state"] == "stopping", "the last heartbeat")
     again_s = time.monotonic()
     stage.daemon()
@@ -122,11 +73,11 @@ def hung(stage: Stage) -> Seen:
     """All its threads stand still, as on a machine that swaps."""
     daemon, watcher = stage.running()
     at_s = daemon.signal(signal.SIGSTOP)
-    saw = f"{_change(watcher, at_s, 'silent')}, {_change(watcher, at_s, 'gone')}"
+    saw = f"{change(watcher, at_s, 'silent')}, {change(watcher, at_s, 'gone')}"
     time.sleep(max(at_s + 3 - time.monotonic(), 0))
     on_s = daemon.signal(signal.SIGCONT)
     healthy_s = watcher.fresh_after(on_s)
-    return Seen(saw, healthy_s, f"the pairs of {_silence(watcher, at_s):.1f} s; {_lost(watcher, at_s)}")
+    return Seen(saw, healthy_s, f"the pairs of {silence(watcher, at_s):.1f} s; {lost(watcher, at_s)}")
 
 
 @fault("daemon", "started twice", "a second daemon of the same rig")
@@ -136,8 +87,8 @@ def twice(stage: Stage) -> Seen:
     at_s = time.monotonic()
     code = ended(stage.daemon())
     watcher.tracks(time.monotonic())
-    _require(code == ExitCode.ALREADY_RUNNING, f"the second ended with {code}")
-    return Seen(f"{_changes(watcher, at_s)}; the second ended with exit code {code}", 0.0, _lost(watcher, at_s))
+    require(code == ExitCode.ALREADY_RUNNING, f"the second ended with {code}")
+    return Seen(f"{changes(watcher, at_s)}; the second ended with exit code {code}", 0.0, lost(watcher, at_s))
 
 
 @fault("daemon", "the auditing process killed", "SIGKILL to it alone")
@@ -147,11 +98,11 @@ def auditor_killed(stage: Stage) -> Seen:
     at_s, pid = time.monotonic(), daemon.auditor()
     os.kill(pid, signal.SIGKILL)
     until(lambda: all(process.pid != pid for process in daemon.family()), "the end of the auditing process")
-    _require(daemon.auditor() != pid, "it is not another process")
+    require(daemon.auditor() != pid, "it is not another process")
     again_s = time.monotonic() - at_s
     watcher.tracks(time.monotonic(), 30)
-    saw = f"{_changes(watcher, at_s)}; another one after {again_s:.1f} s"
-    return Seen(saw, 0.0, f"{_lost(watcher, at_s)}; no track was audited meanwhile")
+    saw = f"{changes(watcher, at_s)}; another one after {again_s:.1f} s"
+    return Seen(saw, 0.0, f"{lost(watcher, at_s)}; no track was audited meanwhile")
 
 
 # --- cameras, behind the ioctl edge
@@ -165,7 +116,7 @@ def dropped_buffers(stage: Stage) -> Seen:
     daemon.say("skip", 0, 5)
     until(lambda: watcher.drops().get("lost_by_driver", 0) >= before.get("lost_by_driver", 0) + 5, "5 lost frames")
     healthy_s = watcher.fresh_after(at_s)
-    return Seen("no change of health", healthy_s, _counted(watcher, before))
+    return Seen("no change of health", healthy_s, counted(watcher, before))
 
 
 @fault("cameras", "buffers with the error flag", "5 buffers of the left camera flagged")
@@ -175,8 +126,8 @@ def flagged_buffers(stage: Stage) -> Seen:
     before, at_s = watcher.drops(), time.monotonic()
     daemon.say("flag", 0, 5)
     until(lambda: watcher.drops().get("buffer_error", 0) >= before.get("buffer_error", 0) + 5, "5 buffer errors")
-    saw = _changes(watcher, at_s)
-    return Seen(saw, watcher.fresh_after(time.monotonic()), _counted(watcher, before))
+    saw = changes(watcher, at_s)
+    return Seen(saw, watcher.fresh_after(time.monotonic()), counted(watcher, before))
 
 
 @fault("cameras", "QBUF fails", "VIDIOC_QBUF of the left camera refused 3 times with EINVAL")
@@ -188,7 +139,7 @@ def qbuf(stage: Stage) -> Seen:
     beat = watcher.heartbeat(at_s, lambda b: b["cameras"]["left"]["queue_errors"] > 0, "a queue error")
     watcher.tracks(beat["at_s"], 30)
     errors = watcher.since(at_s, "heartbeat")[-1]["heartbeat"]["cameras"]["left"]["queue_errors"]
-    return Seen(f"queue_errors {errors} in the status; {_changes(watcher, at_s)}", 0.0, _counted(watcher, before))
+    return Seen(f"queue_errors {errors} in the status; {changes(watcher, at_s)}", 0.0, counted(watcher, before))
 
 
 @fault("cameras", "STREAMON fails", "unplugged; VIDIOC_STREAMON refused 3 times with EIO after the return")
@@ -211,7 +162,7 @@ def stalled(stage: Stage) -> Seen:
     daemon, watcher = stage.running()
     before, at_s = watcher.drops(), time.monotonic()
     daemon.say("stall", 1)
-    saw = _change(watcher, at_s, "silent")
+    saw = change(watcher, at_s, "silent")
     beat = watcher.heartbeat(at_s, lambda b: b["cameras"]["right"]["state"] != "streaming", "a camera's state")
     state = beat["heartbeat"]["cameras"]["right"]["state"]
     time.sleep(max(at_s + 3 - time.monotonic(), 0))
@@ -219,7 +170,7 @@ def stalled(stage: Stage) -> Seen:
     daemon.say("resume", 1)
     healthy_s = watcher.fresh_after(on_s)
     told = f"{saw}; right camera {state} in the status after {beat['at_s'] - at_s:.2f} s"
-    return Seen(told, healthy_s, f"the pairs of {_silence(watcher, at_s):.1f} s; {_counted(watcher, before)}")
+    return Seen(told, healthy_s, f"the pairs of {silence(watcher, at_s):.1f} s; {counted(watcher, before)}")
 
 
 @fault("cameras", "one camera unplugged", "the left camera gone for 2 s")
@@ -228,14 +179,14 @@ def unplugged(stage: Stage) -> Seen:
     daemon, watcher = stage.running()
     at_s = time.monotonic()
     daemon.say("unplug", 0)
-    saw = _change(watcher, at_s, "silent")
+    saw = change(watcher, at_s, "silent")
     beat = watcher.heartbeat(at_s, lambda b: b["cameras"]["left"]["state"] == "absent", "the left camera absent")
     time.sleep(max(at_s + 2 - time.monotonic(), 0))
     on_s = time.monotonic()
     daemon.say("plug", 0)
     healthy_s = watcher.fresh_after(on_s)
     told = f"{saw}; left camera absent in the status after {beat['at_s'] - at_s:.2f} s"
-    return Seen(told, healthy_s, f"the pairs of {_silence(watcher, at_s):.1f} s")
+    return Seen(told, healthy_s, f"the pairs of {silence(watcher, at_s):.1f} s")
 
 
 @fault("cameras", "both unplugged, back under other numbers", "both gone for 2 s, /dev/video0 and 1 exchanged")
@@ -245,7 +196,7 @@ def swapped(stage: Stage) -> Seen:
     at_s = time.monotonic()
     for number in (0, 1):
         daemon.say("unplug", number)
-    saw = _change(watcher, at_s, "silent")
+    saw = change(watcher, at_s, "silent")
     daemon.say("swap")
     time.sleep(max(at_s + 2 - time.monotonic(), 0))
     on_s = time.monotonic()
@@ -255,7 +206,7 @@ def swapped(stage: Stage) -> Seen:
     node = watcher.heartbeat(on_s, lambda b: b["cameras"]["left"]["state"] == "streaming", "streaming")
     where = node["heartbeat"]["cameras"]["left"]["node"]
     until(lambda: _any_ok(watcher, on_s), "an ok track: left and right are exchanged")
-    return Seen(f"{saw}; the left camera now at {where}", healthy_s, f"the pairs of {_silence(watcher, at_s):.1f} s")
+    return Seen(f"{saw}; the left camera now at {where}", healthy_s, f"the pairs of {silence(watcher, at_s):.1f} s")
 
 
 @fault("cameras", "both gone at the start", "plugged in 2 s after the daemon was ready")
@@ -338,17 +289,15 @@ def recorder_killed(stage: Stage) -> Seen:
     pairs = beat["heartbeat"]["recording"]["pairs"]
     again = watcher.heartbeat(beat["at_s"], lambda b: b["recording"]["pairs"] > pairs, "a recording that goes on")
     watcher.tracks(again["at_s"], 20)
-    _require(daemon.recorder() != recorder, "the recording process is the one that was killed")
-    saw = (
-        f"recording.error “{beat['heartbeat']['recording']['error']}” in the status; tracks: {_changes(watcher, at_s)}"
-    )
-    lost_tracks = _lost(watcher, at_s)
+    require(daemon.recorder() != recorder, "the recording process is the one that was killed")
+    saw = f"recording.error “{beat['heartbeat']['recording']['error']}” in the status; tracks: {changes(watcher, at_s)}"
+    lost_tracks = lost(watcher, at_s)
     told = _stop(daemon)
     (second,) = (len(McapRecording(path)) for path in stage.folder.glob("*.mcap") if path != first)
     saved = recover(first, stage.folder / "saved.mcap").pairs
-    _require(saved + second >= int(str(told["recorded"])), f"{saved} and {second} pairs are there of {told}")
-    lost = f"tracks: {lost_tracks}; recording: {told['unrecorded']} pairs, all counted"
-    return Seen(saw, again["at_s"] - at_s, lost)
+    require(saved + second >= int(str(told["recorded"])), f"{saved} and {second} pairs are there of {told}")
+    unrecorded = f"recording: {told['unrecorded']} pairs, all counted"
+    return Seen(saw, again["at_s"] - at_s, f"tracks: {lost_tracks}; {unrecorded}")
 
 
 @fault("disk", "power cut while recording", "SIGKILL to the daemon and its recorder; `needletrack recover`")
@@ -364,130 +313,9 @@ def cut_off(stage: Stage) -> Seen:
     began_s = time.monotonic()
     saved = recover(damaged, stage.folder / "saved.mcap")
     took_s = time.monotonic() - began_s
-    _require(len(McapRecording(stage.folder / "saved.mcap")) == saved.pairs, "what was saved is not whole")
+    require(len(McapRecording(stage.folder / "saved.mcap")) == saved.pairs, "what was saved is not whole")
     told = f"{saved.pairs} pairs saved of {recorded} that the last heartbeat called recorded"
     return Seen("gone", took_s, f"{told}; {saved.lost_bytes} bytes at the end were not whole")
-
-
-# --- the network
-
-
-@fault("network", "router killed", "SIGKILL; started anew at once")
-def router_killed(stage: Stage) -> Seen:
-    """Daemon and subscriber are clients of it."""
-    router, watcher = _routed(stage)
-    at_s = router.signal(signal.SIGKILL)
-    saw = _change(watcher, at_s, "gone", "silent")
-    ended(router)
-    again_s = time.monotonic()
-    stage.router()
-    healthy_s = watcher.fresh_after(again_s)
-    return Seen(saw, healthy_s, f"{_silence(watcher, at_s):.1f} s of tracks; {_lost(watcher, at_s)}")
-
-
-@fault("network", "router hung", "SIGSTOP for 4 s, SIGCONT")
-def router_hung(stage: Stage) -> Seen:
-    """Its connections stay open and carry nothing."""
-    router, watcher = _routed(stage)
-    at_s = router.signal(signal.SIGSTOP)
-    saw = f"{_change(watcher, at_s, 'silent')}, {_change(watcher, at_s, 'gone')}"
-    time.sleep(max(at_s + 4 - time.monotonic(), 0))
-    on_s = router.signal(signal.SIGCONT)
-    healthy_s = watcher.fresh_after(on_s)
-    return Seen(saw, healthy_s, f"{_silence(watcher, at_s):.1f} s of tracks; {_lost(watcher, at_s)}")
-
-
-@fault("network", "router late", "started 3 s after daemon and subscriber")
-def router_late(stage: Stage) -> Seen:
-    """Both open without it."""
-    watcher = _client(stage)
-    stage.daemon("--connect", stage.endpoint, listen=False)
-    seen = watcher.health(0.0, "never_seen")
-    # As long as a daemon takes to start here.
-    time.sleep(6)
-    on_s = time.monotonic()
-    stage.router()
-    return Seen(seen["health"], watcher.fresh_after(on_s), "the tracks until then, which nobody could receive")
-
-
-@fault("network", "link cut", "both directions closed and refused for 2 s")
-def link_cut(stage: Stage) -> Seen:
-    """A cable pulled at the subscriber's end."""
-    link, watcher = _linked(stage)
-    at_s = link.cut()
-    saw = _change(watcher, at_s, "gone", "silent")
-    time.sleep(max(at_s + 2 - time.monotonic(), 0))
-    healthy_s = watcher.fresh_after(link.heal())
-    return Seen(saw, healthy_s, f"{_silence(watcher, at_s):.1f} s of tracks; {_lost(watcher, at_s)}")
-
-
-@fault("network", "link hung", "no byte passed for 3 s, connections open")
-def link_hung(stage: Stage) -> Seen:
-    """A switch that forgets, a laptop that sleeps."""
-    link, watcher = _linked(stage)
-    at_s = link.hold()
-    saw = f"{_change(watcher, at_s, 'silent')}, {_change(watcher, at_s, 'gone')}"
-    time.sleep(max(at_s + 3 - time.monotonic(), 0))
-    healthy_s = watcher.fresh_after(link.heal())
-    return Seen(saw, healthy_s, f"{_silence(watcher, at_s):.1f} s of tracks; {_lost(watcher, at_s)}")
-
-
-@fault("network", "another subscriber hangs", "SIGSTOP to a second subscriber for 4 s")
-def other_hangs(stage: Stage) -> Seen:
-    """It must not hold the first one up."""
-    _, watcher = stage.running()
-    other = stage.watcher()
-    fresh(other)
-    before_s = time.monotonic()
-    watcher.tracks(before_s, 90)
-    at_s = other.signal(signal.SIGSTOP)
-    time.sleep(4)
-    on_s = other.signal(signal.SIGCONT)
-    before, during = (_p99_ms(watcher, *span) for span in ((before_s, at_s), (at_s, on_s)))
-    healthy_s = other.fresh_after(on_s)
-    saw = f"the first: {_changes(watcher, at_s)}, p99 {during:.1f} ms after {before:.1f} ms before"
-    return Seen(saw, healthy_s, f"the first: {_lost(watcher, at_s)}; the second: {_lost(other, at_s)}")
-
-
-@fault("network", "another subscriber killed", "SIGKILL to a second subscriber")
-def other_killed(stage: Stage) -> Seen:
-    """Its connection breaks."""
-    _, watcher = stage.running()
-    other = stage.watcher()
-    fresh(other)
-    at_s = other.signal(signal.SIGKILL)
-    watcher.tracks(at_s, 60)
-    return Seen(f"the first: {_changes(watcher, at_s)}", 0.0, _lost(watcher, at_s))
-
-
-@fault(
-    "network",
-    "nonsense on our keys",
-    "100 random payloads and one of 64 MB, put by a neighbour",
-)
-def nonsense(stage: Stage) -> Seen:
-    """Who may put at all is decided by certificates; what is put is checked."""
-    rogue = free_endpoint()
-    stage.daemon()
-    random = np.random.default_rng(7)
-    with open_session(listen=[rogue]) as session:
-        # The daemon passes on nothing that another peer puts: it must be a neighbour of the subscriber itself.
-        watcher = stage.watcher(stage.endpoint, rogue)
-        fresh(watcher)
-        at_s = time.monotonic()
-        for number in range(100):
-            session.put(f"needletrack/{stage.rig}/track", random.bytes(number * 10))
-        session.put(f"needletrack/{stage.rig}/track", bytes(2 * MOST_RECEIVED_BYTES))
-        watcher.tracks(time.monotonic(), 30)
-    counts = [seen["undecodable"] for seen in watcher.since(at_s, "undecodable")]
-    _require(bool(counts), "no payload reached the subscriber")
-    saw = f"{counts[-1]} counted as undecodable; {_changes(watcher, at_s)}"
-    return Seen(saw, watcher.fresh_after(time.monotonic()), _lost(watcher, at_s))
-
-
-def _require(condition: bool, what: str) -> None:
-    if not condition:
-        raise Missed(what)
 
 
 def _runs(process: psutil.Process) -> bool:
@@ -504,19 +332,8 @@ def _shared_memory(child: Child) -> set[Path]:
     return {Path(word) for word in mapped if word.startswith("/dev/shm/psm_")}
 
 
-def _changes(watcher: Watcher, since_s: float) -> str:
-    """The states of health since a moment, but for fresh."""
-    states = dict.fromkeys(s["health"] for s in watcher.since(since_s, "health") if s["health"] != "fresh")
-    return ", ".join(states) or "no change of health"
-
-
 def _any_ok(watcher: Watcher, since_s: float) -> bool:
     return any(seen["status"] == "ok" for seen in watcher.since(since_s, "track"))
-
-
-def _p99_ms(watcher: Watcher, from_s: float, to_s: float) -> float:
-    latencies = [s["latency_ms"] for s in watcher.since(from_s, "track") if s["at_s"] < to_s]
-    return float(np.percentile(latencies, 99))
 
 
 def _first(errors: set[str]) -> str:
@@ -529,33 +346,7 @@ def _refused(stage: Stage, *options: str) -> Seen:
     code = ended(daemon)
     state = watcher.since(0.0, "health")[-1]["health"]
     told = daemon.stderr().strip().splitlines()[-1].removeprefix("needletrack: ")
-    return Seen(f"{state}; the daemon ends with exit code {code}: “{_short(told, stage)}”", None, NOTHING)
-
-
-def _short(told: str, stage: Stage) -> str:
-    told = told.replace(str(stage.folder), "…")
-    return told if len(told) < 160 else f"{told[:157]}..."
-
-
-def _client(stage: Stage) -> Watcher:
-    """A subscriber that is a router's client: a router passes nothing on between peers that know of each other."""
-    return stage.watcher(mode="client")
-
-
-def _routed(stage: Stage) -> tuple[Child, Watcher]:
-    watcher = _client(stage)
-    router = stage.router()
-    stage.daemon("--connect", stage.endpoint, listen=False)
-    fresh(watcher)
-    return router, watcher
-
-
-def _linked(stage: Stage) -> tuple[Link, Watcher]:
-    stage.daemon()
-    link = stage.link()
-    watcher = stage.watcher(link.endpoint)
-    fresh(watcher)
-    return link, watcher
+    return Seen(f"{state}; the daemon ends with exit code {code}: “{short(told, stage)}”", None, NOTHING)
 
 
 def _recording_resumes(watcher: Watcher, beat: dict[str, object], gone_s: float | None = None) -> Seen:
@@ -569,19 +360,15 @@ def _recording_resumes(watcher: Watcher, beat: dict[str, object], gone_s: float 
     error = beat["heartbeat"]["recording"]["error"]  # type: ignore[index]
     watcher.tracks(again["at_s"], 5)
     unrecorded = watcher.since(0.0, "heartbeat")[-1]["heartbeat"]["recording"]["dropped"]
-    saw = f"recording.error “{str(error).rsplit('/', maxsplit=1)[-1]}” in the status; tracks: {_changes(watcher, at_s)}"
-    lost = f"tracks: {_lost(watcher, at_s)}; recording: {unrecorded} pairs"
-    return Seen(saw, again["at_s"] - (gone_s or at_s), lost)
+    saw = f"recording.error “{str(error).rsplit('/', maxsplit=1)[-1]}” in the status; tracks: {changes(watcher, at_s)}"
+    cost = f"tracks: {lost(watcher, at_s)}; recording: {unrecorded} pairs"
+    return Seen(saw, again["at_s"] - (gone_s or at_s), cost)
 
 
 def _stop(daemon: Child) -> dict[str, object]:
     daemon.signal(signal.SIGTERM)
     ended(daemon)
     return said_last(daemon.process.stdout)
-
-
-class NotHere(Exception):
-    """This machine does not let the fault be injected."""
 
 
 @contextmanager

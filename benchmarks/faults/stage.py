@@ -3,21 +3,23 @@
 import json
 import os
 import signal
-import socket
 import subprocess
 import sys
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import IO, Any, Self
 
 import psutil
+from tests.publish.relay import Relay
 
 from benchmarks.loopback import free_endpoint
+from needletrack.authority import init_security
+from needletrack.publish.tls import TlsFiles
 
 ROOT = Path(__file__).parents[2]
 RECORDING = ROOT / "tests" / "data" / "recordings" / "steer-b"
@@ -121,8 +123,8 @@ def _writes_a_recording(process: psutil.Process) -> bool:
 class Watcher(Child):
     """The subscriber, and what it wrote so far."""
 
-    def __init__(self, rig: str, *endpoints: str, mode: str = "peer") -> None:
-        super().__init__("benchmarks.faults.watcher", mode, rig, *endpoints)
+    def __init__(self, rig: str, *endpoints: str, options: Sequence[str] = ()) -> None:
+        super().__init__("benchmarks.faults.watcher", rig, *endpoints, *options)
         self.seen: list[dict[str, Any]] = []
         self._reader = threading.Thread(target=self._read, daemon=True)
         self._reader.start()
@@ -184,69 +186,6 @@ class Watcher(Child):
         return dict(newest["dropped"])
 
 
-class Link:
-    """A TCP link between a port here and an endpoint: it can be cut, held and healed."""
-
-    def __init__(self, endpoint: str) -> None:
-        host, port = endpoint.removeprefix("tcp/").split(":")
-        self._to = host, int(port)
-        self._server: socket.socket | None = None
-        self._sockets: set[socket.socket] = set()
-        self.flows = threading.Event()
-        self.flows.set()
-        self.endpoint = free_endpoint()
-        self.heal()
-
-    def heal(self) -> float:
-        """Take connections, pass bytes; when."""
-        self.flows.set()
-        if self._server is None:
-            self._server = socket.create_server(("127.0.0.1", int(self.endpoint.rsplit(":", 1)[1])))
-            threading.Thread(target=self._accept, args=(self._server,), daemon=True).start()
-        return time.monotonic()
-
-    def hold(self) -> float:
-        """Pass no bytes on, and keep the connections; when."""
-        self.flows.clear()
-        return time.monotonic()
-
-    def cut(self) -> float:
-        """Close every connection and take no other; when."""
-        if self._server is not None:
-            with suppress(OSError):
-                self._server.shutdown(socket.SHUT_RDWR)
-            self._server.close()
-        self._server = None
-        for each in list(self._sockets):
-            with suppress(OSError):
-                each.shutdown(socket.SHUT_RDWR)
-            each.close()
-        self._sockets.clear()
-        return time.monotonic()
-
-    def _accept(self, server: socket.socket) -> None:
-        with suppress(OSError):
-            while True:
-                here, _ = server.accept()
-                try:
-                    there = socket.create_connection(self._to)
-                except OSError:
-                    here.close()
-                    continue
-                self._sockets |= {here, there}
-                for one, other in ((here, there), (there, here)):
-                    threading.Thread(target=self._pass, args=(one, other), daemon=True).start()
-
-    def _pass(self, one: socket.socket, other: socket.socket) -> None:
-        with suppress(OSError):
-            while data := one.recv(1 << 16):
-                self.flows.wait()
-                other.sendall(data)
-        for each in (one, other):
-            with suppress(OSError):
-                each.shutdown(socket.SHUT_RDWR)
-
-
 @dataclass
 class Stage:
     """One fault's surroundings; everything on it ends with it."""
@@ -255,6 +194,7 @@ class Stage:
     opened: ExitStack = field(default_factory=ExitStack)
     rig: str = field(default_factory=lambda: f"faults-{os.getpid()}")
     endpoint: str = field(default_factory=free_endpoint)
+    pki: Path | None = None
 
     @classmethod
     @contextmanager
@@ -265,27 +205,47 @@ class Stage:
             with stage.opened:
                 yield stage
 
+    def secure(self) -> Path:
+        """An authority and certificates for the rig, which daemon and subscriber show from now on; their folder."""
+        self.pki = self.folder / "pki"
+        self.endpoint = secured(self.endpoint)
+        init_security(self.pki, self.rig)
+        return self.pki
+
+    def files(self, role: str, rig: str | None = None) -> TlsFiles:
+        """What a role of a rig, without any this one, shows."""
+        assert self.pki is not None
+        folder = self.pki / (rig or self.rig) / role
+        return TlsFiles(folder / "authority.pem", folder / "certificate.pem", folder / "key.pem")
+
     def daemon(self, *arguments: str, listen: bool = True) -> Child:
         """A daemon, started and not waited for."""
         here = ["--listen", self.endpoint] if listen else []
-        command = [str(RECORDING), "--name", self.rig, *here, *arguments]
+        command = [str(RECORDING), "--name", self.rig, *here, *self._shown("publisher"), *arguments]
         return self._child(Child("benchmarks.faults.daemon", *command))
 
-    def watcher(self, *endpoints: str, mode: str = "peer") -> Watcher:
-        """A subscriber, started and not waited for; mode: client of a router, or peer."""
-        watcher = Watcher(self.rig, *(endpoints or (self.endpoint,)), mode=mode)
+    def watcher(self, *endpoints: str, mode: str = "peer", options: Sequence[str] = ()) -> Watcher:
+        """A subscriber, started and not waited for; mode: client of a router, or peer; options: of watcher.py."""
+        options = ["--mode", mode, *self._shown("controller"), *options]
+        watcher = Watcher(self.rig, *(endpoints or (self.endpoint,)), options=options)
         self.opened.callback(watcher.close)
         return watcher
+
+    def bystanders(self, role: str, count: int, *options: str) -> None:
+        """Other subscribers of the tracks (benchmarks/fanout.py), there as this returns."""
+        command = ["--role", role, "--rig", self.rig, *options, self.endpoint, self.endpoint]
+        for child in [self._child(Child("benchmarks.fanout", *command)) for _ in range(count)]:
+            assert child.process.stdout is not None
+            if child.process.stdout.readline() != "ready\n":
+                raise Missed(f"another subscriber did not start: {child.stderr()[-500:]}")
 
     def router(self) -> Child:
         """A router at the stage's endpoint."""
         return self._child(Child("benchmarks.faults.router", self.endpoint))
 
-    def link(self) -> Link:
+    def link(self) -> Relay:
         """A link to the stage's endpoint."""
-        link = Link(self.endpoint)
-        self.opened.callback(link.cut)
-        return link
+        return self.opened.enter_context(Relay(int(self.endpoint.rsplit(":", 1)[1])))
 
     def running(self, *arguments: str) -> tuple[Child, Watcher]:
         """A daemon and a subscriber that calls its tracks fresh."""
@@ -293,9 +253,17 @@ class Stage:
         fresh(watcher)
         return daemon, watcher
 
+    def _shown(self, role: str) -> list[str]:
+        return [] if self.pki is None else ["--tls", str(self.pki / self.rig / role)]
+
     def _child(self, child: Child) -> Child:
         self.opened.callback(child.close)
         return child
+
+
+def secured(endpoint: str) -> str:
+    """The same place, over TLS."""
+    return endpoint.replace("tcp/", "tls/")
 
 
 def fresh(watcher: Watcher) -> None:
@@ -308,6 +276,14 @@ def fresh(watcher: Watcher) -> None:
 
     until(enough, "the first tracks", _STARTS_WITHIN_S)
     watcher.fresh_after(time.monotonic())
+
+
+def routing(router: Child) -> float:
+    """Wait until a router takes connections; when it did."""
+    assert router.process.stdout is not None
+    if router.process.stdout.readline() != "routing\n":
+        raise Missed(f"the router ended: {router.stderr()[-500:]}")
+    return time.monotonic()
 
 
 def ended(child: Child, timeout_s: float = WAIT_S) -> int:

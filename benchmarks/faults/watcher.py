@@ -1,14 +1,16 @@
-"""The independent subscriber: python -m benchmarks.faults.watcher MODE RIG ENDPOINT... writes what it sees.
+"""The independent subscriber: python -m benchmarks.faults.watcher RIG ENDPOINT... writes what it sees.
 
 Times are CLOCK_MONOTONIC, which all processes of a machine share.
 """
 
+import argparse
 import json
 import sys
 import time
-from typing import Any
+from pathlib import Path
 
 from needletrack.client import Freshness, StatusMessage, Subscriber
+from needletrack.publish.tls import TlsFiles
 
 _LOOK_EVERY_S = 0.004
 # At ten pairs a second a track is a tenth of a second old before the next one is there.
@@ -17,12 +19,23 @@ _MAX_AGE_S = 0.5
 
 def main() -> int:
     """Watch until the end of the process."""
-    mode, rig, *endpoints = sys.argv[1:]
-    options: dict[str, Any] = {"mode": mode}
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("rig")
+    parser.add_argument("endpoints", nargs="+")
+    parser.add_argument("--mode", choices=("peer", "client"), default="peer")
+    parser.add_argument("--tls", type=Path, help="folder of authority, certificate and key")
+    parser.add_argument("--capacity", type=int, default=1024, help="tracks that wait")
+    parser.add_argument("--work-s", type=float, default=0.0, help="what a track costs this reader")
+    asked = parser.parse_args()
+    tls = None
+    if asked.tls is not None:
+        tls = TlsFiles(*(asked.tls / f"{name}.pem" for name in ("authority", "certificate", "key")))
     state: Freshness | None = None
     status: StatusMessage | None = None
     undecodable = 0
-    with Subscriber(rig, endpoints, capacity=1024, max_age_s=_MAX_AGE_S, **options) as subscriber:
+    with Subscriber(
+        asked.rig, asked.endpoints, capacity=asked.capacity, max_age_s=_MAX_AGE_S, mode=asked.mode, tls=tls
+    ) as subscriber:
         while True:
             received = subscriber.next(_LOOK_EVERY_S)
             if received is not None:
@@ -36,6 +49,7 @@ def main() -> int:
                     missed=[missed.dropped, missed.lost, missed.overflowed],
                     dropped=dict(message.dropped),
                 )
+                time.sleep(asked.work_s)
             health = subscriber.health
             if health.state is not state:
                 state = health.state
@@ -43,7 +57,12 @@ def main() -> int:
             if subscriber.status is not status:
                 status = subscriber.status
                 assert status is not None
-                _tell(time.monotonic(), heartbeat=json.loads(status.to_json()))
+                clock = subscriber.clock
+                _tell(
+                    time.monotonic(),
+                    heartbeat=json.loads(status.to_json()),
+                    clock_ms=None if clock is None else clock.ours_minus_daemons_ms,
+                )
             if subscriber.undecodable != undecodable:
                 undecodable = subscriber.undecodable
                 _tell(time.monotonic(), undecodable=undecodable)

@@ -3,8 +3,8 @@
 from pathlib import Path
 
 import pytest
-from benchmarks.faults.__main__ import BEGIN, END, line, main, update
-from benchmarks.faults.rows import FAULTS, Fault, Seen
+from benchmarks.faults.__main__ import BEGIN, END, FAULTS, line, main, update
+from benchmarks.faults.table import Fault, Seen
 
 ROOT = Path(__file__).parents[2]
 
@@ -38,7 +38,9 @@ def test_a_table_replaces_the_one_before(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["stopped", "one camera unplugged", "power cut while recording", "link cut"])
+@pytest.mark.parametrize(
+    "name", ["stopped", "one camera unplugged", "power cut while recording", "link cut", "a false neighbour", "invalid"]
+)
 def test_a_fault_is_survived(name: str, capfd: pytest.CaptureFixture[str]) -> None:
     assert main([name]) == 0, capfd.readouterr().err
     assert f": {name} |" in capfd.readouterr().out

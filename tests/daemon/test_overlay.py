@@ -4,7 +4,6 @@ import json
 import queue
 import threading
 import time
-from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -14,7 +13,7 @@ import zenoh
 from tests.capture.fake_kernel import RunningKernel, two_cameras
 from tests.daemon.test_run import config_for, free_port, noise, running
 from tests.publish.network import WAIT_S, eventually
-from tests.recording.small_recording import SIZE_PX, small_rig
+from tests.recording.small_recording import SIZE_PX, own_rig
 
 from needletrack.daemon.overlay import Overlays
 from needletrack.daemon.run import Daemon
@@ -24,12 +23,6 @@ from needletrack.publish.message import TrackMessage
 from needletrack.publish.overlay import OverlayPublisher
 from needletrack.publish.schema import example_messages, example_track
 from needletrack.publish.session import open_session
-from needletrack.rig import Rig
-
-
-def own_rig() -> Rig:
-    """Under a name of its own: a machine runs one daemon of a rig."""
-    return replace(small_rig(), name="overlaid")
 
 
 def test_pictures_come_to_who_looks_and_the_tracks_session_carries_none() -> None:

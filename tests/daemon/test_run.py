@@ -23,7 +23,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 from tests.capture.fake_kernel import FakeCamera, RunningKernel, two_cameras
-from tests.recording.small_recording import SIZE_PX, image_of, small_rig
+from tests.recording.small_recording import SIZE_PX, image_of, own_rig
 from typer.testing import CliRunner
 
 from needletrack.calibration.drift import Motion
@@ -125,7 +125,7 @@ def running(rig: Rig, config: Config, kernel: RunningKernel) -> Iterator[Running
 
 
 def test_cameras_in_messages_out(tmp_path: Path) -> None:
-    rig, port = small_rig(), free_port()
+    rig, port = own_rig(), free_port()
     config = config_for(rig, recording={"folder": tmp_path, "buffer_mb": 16}, daemon={"metrics_port": port})
     kernel = RunningKernel(two_cameras(SIZE_PX), noise)
     with running(rig, config, kernel) as daemon:
@@ -160,7 +160,7 @@ def test_cameras_in_messages_out(tmp_path: Path) -> None:
     assert 'needletrack_tracks_total{status="invalid"}' in metrics
     assert 'needletrack_camera_streaming{camera="left"} 1.0' in metrics
     assert "needletrack_latency_seconds_count" in metrics
-    (file,) = tmp_path.glob("small-*.mcap")
+    (file,) = tmp_path.glob(f"{rig.name}-*.mcap")
     recording = McapRecording(file)
     assert len(recording) == summary.recorded
     assert summary.recorded is not None
@@ -176,7 +176,7 @@ def test_cameras_in_messages_out(tmp_path: Path) -> None:
 
 
 def test_a_camera_unplugged_is_told_and_back_within_two_seconds(caplog: pytest.LogCaptureFixture) -> None:
-    rig = small_rig()
+    rig = own_rig()
     cameras = two_cameras(SIZE_PX)
     with running(rig, config_for(rig), RunningKernel(cameras, noise)) as daemon:
         daemon.next()
@@ -218,7 +218,7 @@ def registered_before_a_camera_was_turned(rig: Rig) -> Rig:
 
 def test_an_old_calibration_is_said_at_the_start_and_in_every_heartbeat(caplog: pytest.LogCaptureFixture) -> None:
     info = CalibrationInfo(calibrated_at=datetime.now(UTC) - timedelta(days=45))
-    rig = replace(small_rig(), calibration=info)
+    rig = replace(own_rig(), calibration=info)
     for max_age_days, is_old in ((30.0, True), (60.0, False)):
         caplog.clear()
         config = config_for(rig, rig={"max_age_days": max_age_days})
@@ -228,6 +228,11 @@ def test_an_old_calibration_is_said_at_the_start_and_in_every_heartbeat(caplog: 
         said = [record for record in caplog.records if "calibrated 45 days ago, more than 30" in record.getMessage()]
         assert [record.levelname for record in said] == ["WARNING"] * is_old
         assert status.calibration.warning == (said[0].getMessage() if is_old else None)
+
+
+def steered() -> Rig:
+    """The rig of steer-b, under a name of its own."""
+    return replace(AslRecording(STEER).rig, name=own_rig().name)
 
 
 def live_and_replayed(
@@ -282,7 +287,7 @@ def live_and_replayed(
 
 @pytest.mark.slow
 def test_what_was_tracked_of_too_many_pairs_is_replayed_as_it_was(tmp_path: Path) -> None:
-    live = live_and_replayed(tmp_path, AslRecording(STEER).rig, 150, rate_hz=50.0)
+    live = live_and_replayed(tmp_path, steered(), 150, rate_hz=50.0)
     # The first pair is searched while others come.
     assert len(live) < 150
     assert live[0].searched_sequence == live[0].sequence
@@ -292,7 +297,7 @@ def test_what_was_tracked_of_too_many_pairs_is_replayed_as_it_was(tmp_path: Path
 
 
 def test_recorded_live_and_replayed_give_the_same_bytes_in_the_robot_s_frame(tmp_path: Path) -> None:
-    live = live_and_replayed(tmp_path, registered_before_a_camera_was_turned(AslRecording(STEER).rig), 2)
+    live = live_and_replayed(tmp_path, registered_before_a_camera_was_turned(steered()), 2)
     assert any(message.centerline_mm for message in live)
     assert {message.frame_id for message in live} == {"robot_base"}
     in_robot_mm = np.array([message.tip.position_mm for message in live if message.tip is not None])
@@ -317,7 +322,7 @@ def sixteen_bits(image: Image) -> Image16:
 
 
 def test_sixteen_bits_are_recorded_and_tracked_live_and_in_the_replay_as_their_upper_eight(tmp_path: Path) -> None:
-    rig, count = AslRecording(STEER).rig, 2
+    rig, count = steered(), 2
     assert live_and_replayed(tmp_path, rig, count, pixels="Y16")[0].centerline_mm
     (file,) = tmp_path.glob("*.mcap")
     recording = McapRecording(file)
@@ -336,7 +341,7 @@ def test_sixteen_bits_are_recorded_and_tracked_live_and_in_the_replay_as_their_u
 
 @pytest.mark.slow
 def test_what_is_told_of_a_turned_camera_live_is_told_by_its_replay(tmp_path: Path) -> None:
-    live = live_and_replayed(tmp_path, registered_before_a_camera_was_turned(AslRecording(STEER).rig), 45)
+    live = live_and_replayed(tmp_path, registered_before_a_camera_was_turned(steered()), 45)
     # When it is told depends on how many tips were seen, and so on the pace at which this machine took the pairs.
     told = ["calibration_drift" in message.reasons for message in live]
     assert not any(told[:4])
@@ -346,7 +351,7 @@ def test_what_is_told_of_a_turned_camera_live_is_told_by_its_replay(tmp_path: Pa
 
 
 def test_a_second_daemon_of_the_rig_is_refused(tmp_path: Path) -> None:
-    rig = small_rig()
+    rig = own_rig()
     with OnlyInstance(rig.name):
         daemon = Daemon(rig, config_for(rig), kernel=RunningKernel(two_cameras(SIZE_PX), noise))
         with pytest.raises(AlreadyRunning, match="already runs on this machine"):
@@ -364,15 +369,15 @@ def test_every_error_has_its_exit_code(error: Exception, code: int) -> None:
 
 
 def test_a_camera_that_cannot_do_it_ends_the_start() -> None:
-    rig = small_rig()
+    rig = own_rig()
     camera = FakeCamera("/dev/video0", "usb-1", formats={"YUYV": [SIZE_PX]})
     with pytest.raises(CaptureError, match="does not do GREY"):
         Daemon(rig, config_for(rig), kernel=RunningKernel([camera], noise)).run(threading.Event())
 
 
 def test_images_of_another_size_than_the_rigs_are_refused() -> None:
-    with pytest.raises(ConfigError, match=r"cameras\.size_px is 1280x1024, but rig small was calibrated at 64x48"):
-        Daemon(small_rig(), config_for(small_rig(), cameras={"size_px": (1280, 1024)}))
+    with pytest.raises(ConfigError, match=r"cameras\.size_px is 1280x1024, but rig small-\d+ was calibrated at 64x48"):
+        Daemon(own_rig(), config_for(own_rig(), cameras={"size_px": (1280, 1024)}))
 
 
 def test_systemd_is_told_when_it_is_ready_that_it_lives_and_that_it_stops(
@@ -385,7 +390,7 @@ def test_systemd_is_told_when_it_is_ready_that_it_lives_and_that_it_stops(
         monkeypatch.setenv("NOTIFY_SOCKET", str(path))
         monkeypatch.setenv("WATCHDOG_USEC", "200000")
         monkeypatch.setenv("WATCHDOG_PID", str(os.getpid()))
-        rig = small_rig()
+        rig = own_rig()
         with running(rig, config_for(rig), RunningKernel(two_cameras(SIZE_PX), noise)) as daemon:
             assert systemd.recv(4096).startswith(b"READY=1\n")
             daemon.next()
@@ -400,7 +405,7 @@ def test_systemd_is_told_when_it_is_ready_that_it_lives_and_that_it_stops(
 
 
 def test_the_command_says_what_is_wrong_in_one_line_with_its_code(tmp_path: Path) -> None:
-    write_rig(small_rig(), tmp_path / "rig.yaml")
+    write_rig(own_rig(), tmp_path / "rig.yaml")
     (tmp_path / "small.toml").write_text("[cameras]\nsize_px = [64, 48]\n")
     runner, rig = CliRunner(), str(tmp_path / "rig.yaml")
     for options, code, told in (

@@ -1,6 +1,7 @@
 """From `security init` to tracks on a terminal: the daemon and the commands take their files from the configuration."""
 
 import json
+import os
 import queue
 import threading
 from concurrent.futures import ThreadPoolExecutor
@@ -29,7 +30,8 @@ from needletrack.publish.session import open_session
 from needletrack.publish.tls import TlsFiles
 from needletrack.rig import Rig
 
-RIG = "secured"
+# One daemon of a rig runs on a machine, and another checkout may be tested at the same time.
+RIG = f"secured-{os.getpid()}"
 
 
 @pytest.fixture(scope="module")

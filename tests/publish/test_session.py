@@ -1,8 +1,15 @@
 import socket
+import time
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import AbstractContextManager
+from itertools import pairwise
 
 import psutil
 import pytest
+from tests.publish.network import WAIT_S, free_port
 
+from needletrack.client import Subscriber
 from needletrack.errors import PublishError
 from needletrack.publish.keys import RigKeys
 from needletrack.publish.session import checked_endpoint, open_session
@@ -14,13 +21,6 @@ def listening() -> set[tuple[str, int]]:
         for connection in psutil.Process().net_connections("inet")
         if connection.status == psutil.CONN_LISTEN or connection.type == socket.SOCK_DGRAM
     }
-
-
-def free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port: int = probe.getsockname()[1]
-        return port
 
 
 def test_a_session_opens_no_socket_but_those_it_was_told_to() -> None:
@@ -46,6 +46,37 @@ def test_any_other_failure_is_told_in_zenohs_words() -> None:
 def test_an_address_of_another_machine_is_named() -> None:
     with pytest.raises(PublishError, match=r"tcp/192\.0\.2\.1:7447 is no address of this machine"):
         open_session(listen=["tcp/192.0.2.1:7447"])
+
+
+def daemons_session(endpoint: str) -> AbstractContextManager[object]:
+    return open_session(connect=[endpoint])
+
+
+def clients_subscriber(endpoint: str) -> AbstractContextManager[object]:
+    return Subscriber("lab", [endpoint], mode="client")
+
+
+@pytest.mark.parametrize("opened", [daemons_session, clients_subscriber])
+def test_who_is_not_there_is_tried_again_at_most_a_second_apart(
+    opened: Callable[[str], AbstractContextManager[object]],
+) -> None:
+    """However long a router has been late: Zenoh's default waits twice as long each time, up to 4 s."""
+    tried_s = []
+    with socket.create_server(("127.0.0.1", 0)) as nobody, ThreadPoolExecutor(1) as pool:
+        nobody.settimeout(WAIT_S)
+
+        def refuse() -> None:
+            # After six, Zenoh's own waits are over 1 s.
+            for _ in range(7):
+                link, _ = nobody.accept()
+                tried_s.append(time.monotonic())
+                link.close()
+
+        refused = pool.submit(refuse)
+        with opened(f"tcp/127.0.0.1:{nobody.getsockname()[1]}"):
+            refused.result()
+    # On a busy machine an attempt itself takes some time.
+    assert max(later - earlier for earlier, later in pairwise(tried_s)) < 2.5
 
 
 @pytest.mark.parametrize(

@@ -1,6 +1,8 @@
 """Small recordings, written where a test wants them."""
 
+import os
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -20,6 +22,11 @@ def small_rig(size_px: tuple[int, int] = SIZE_PX) -> Rig:
     matrix = np.array([[width, 0.0, width / 2], [0.0, width, height / 2], [0.0, 0.0, 1.0]])
     camera = Camera(matrix, np.zeros(4), size_px)
     return Rig(camera, camera, RigidTransform(np.eye(3), np.array([-60.0, 0.0, 0.0])), "small")
+
+
+def own_rig() -> Rig:
+    """Under this process's own name: a machine runs one daemon of a rig, and other tests may run at the same time."""
+    return replace(small_rig(), name=f"small-{os.getpid()}")
 
 
 def image_of(stamp_ns: int) -> Image:

@@ -27,6 +27,9 @@ DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
 # A hung peer is noticed after three quarters of the lease (0.75 s); Zenoh's own default is 10 s.
 LEASE_MS = 1000
 RECONNECT_MS = (100, 1000)
+# For who takes a connection and says nothing, as a router that hangs: Zenoh's own 10 s held up the next attempt, and a
+# client that opens. A link of 0.6 s each way needs 2.4 s, with TLS.
+OPEN_WITHIN_MS = 3000
 # A picture of 32 million pixels.
 MOST_RECEIVED_BYTES = 32_000_000
 CLOSE_WITHIN_S = 0.5
@@ -97,6 +100,7 @@ def open_session(
         # Opening does not wait for an answer (Zenoh would, for half a second, where none comes).
         "open/return_conditions/connect_scouted": False,
         "transport/link/tx/lease": LEASE_MS,
+        "transport/unicast/open_timeout": OPEN_WITHIN_MS,
         # Zenoh's default is a gigabyte, which any peer may then make us hold, and a queue of them; a larger message is
         # left out and the link goes on.
         "transport/link/rx/max_message_size": MOST_RECEIVED_BYTES,

@@ -179,10 +179,11 @@ def under_load(recording: Path, rate_hz: float, seconds: float, *, record: Path 
             audited(pairs[0], None)
         settle_memory()
         assert publisher.wait_for_subscriber(_SUBSCRIBED_WITHIN_S)
-        probe_ = opened.enter_context(_MemoryProbe(recorder, folder))
         cpu = _cpu_s(psutil.Process())
         sinks: list[Sink] = [_Publish(publisher), figures, *([] if recorder is None else [recorder])]
-        run = service.run(sinks, stop)
+        # Until the run ends: a recorder that is closed gives its memory back.
+        with _MemoryProbe(recorder, folder) as memory:
+            run = service.run(sinks, stop)
         cpu_s = _cpu_s(psutil.Process()) - cpu
         recorder_cpu_s = 0.0 if recorder is None else _cpu_s(psutil.Process(recorder.pid))
         publisher.close()
@@ -196,7 +197,7 @@ def under_load(recording: Path, rate_hz: float, seconds: float, *, record: Path 
             read_summary(report),
             None if recorder is None else recorder.recorded,
             None if recorder is None else recorder.dropped,
-            probe_.rows,
+            memory.rows,
             cpu_s,
             recorder_cpu_s,
         )

@@ -297,3 +297,11 @@ def test_what_could_be_asked_of_the_daemon_is_not_in_the_digest(tmp_path: Path) 
     config = load_config(written(tmp_path, '[control]\nenabled = true\ntoken_file = "secret"\nsnapshot_folder = "s"'))
     assert config.digest == Config().digest
     assert (config.control.token_file, config.control.snapshot_folder) == (tmp_path / "secret", tmp_path / "s")
+
+
+def test_an_unknown_key_of_any_length_is_named_in_short(tmp_path: Path) -> None:
+    path = tmp_path / "needletrack.toml"
+    path.write_text(f"{'k' * 5000} = 1\n")
+    with pytest.raises(ConfigError, match="unknown key kkk") as refused:
+        load_config(path)
+    assert len(str(refused.value)) < 500 + len(str(path))

@@ -56,7 +56,7 @@ def complaints(error: ValidationError, model: type[BaseModel]) -> list[Complaint
 
 def _complaint(entry: dict[str, Any], model: type[BaseModel]) -> Complaint:
     path: tuple[str | int, ...] = entry["loc"]
-    key = dotted(path)
+    key = _in_short(dotted(path))
     field, siblings = _look_up(model, path)
     if entry["type"] == "extra_forbidden":
         near = nearest_key(model, path)
@@ -91,5 +91,8 @@ def _look_up(model: type[BaseModel], path: tuple[str | int, ...]) -> tuple[Field
 
 
 def _shortened(value: object) -> str:
-    text = repr(value)
+    return _in_short(repr(value))
+
+
+def _in_short(text: str) -> str:
     return text if len(text) <= 80 else f"{text[:77]}..."

@@ -267,21 +267,29 @@ def live_and_replayed(
 
     # Sooner than by default, which takes more pairs than are played here.
     config = config_for(rig, cameras={"format": pixels}, recording={"folder": folder}, drift={"least_pairs": 5})
-    with running(rig, config, RunningKernel(cameras, shown, rate_hz or 50.0)) as daemon:
-        # Whoever hears heartbeats is connected, and will miss no track.
+    kernel = RunningKernel(cameras, shown, rate_hz or 50.0)
+    with running(rig, config, kernel) as daemon:
         daemon.status(lambda status: status.cameras is not None)
+        service = daemon.daemon.service
+        assert service is not None
         daemons.append(daemon.daemon)
-        daemon.until(lambda received: received.message.sequence == count - 1)
+        until_s = time.monotonic() + 3 * WAIT_S
+        while kernel.delivered < count or sum(service.statuses.values()) + sum(service.dropped.values()) < count:
+            assert time.monotonic() < until_s, (kernel.delivered, service.statuses, service.dropped)
+            time.sleep(0.05)
         summary = daemon.stop()
     (file,) = folder.glob("*.mcap")
     recording = McapRecording(file)
-    assert len(recording) == count
     published = [told for _, told in recording.tracks()]
-    missed = count - len(published)
-    assert summary.run.dropped == ({DropReason.OVERWRITTEN: missed} if missed else {})
-    assert rate_hz is not None or not missed
+    # On a busy machine the driver has lost frames before they were pairs.
+    assert summary.run.dropped.get(DropReason.OVERWRITTEN, 0) == len(recording) - len(published)
+    if rate_hz is None:
+        assert (summary.run.dropped, len(published)) == ({}, count)
     for ours, again in zip(published, replayed(file, config, as_published=True), strict=True):
-        assert json.dumps(without_times(ours)).encode() == json.dumps(without_times(again)).encode()
+        live, once_more = without_times(ours), without_times(again)
+        overwritten = [message.pop("dropped").get(DropReason.OVERWRITTEN, 0) for message in (live, once_more)]
+        assert json.dumps(live).encode() == json.dumps(once_more).encode()
+        assert overwritten[0] == overwritten[1]
     return [TrackMessage.from_json(message) for message in published]
 
 

@@ -143,7 +143,7 @@ def reference() -> Float:
     return np.asarray((vectors / np.sqrt(values)) @ vectors.T)
 
 
-@lru_cache(maxsize=512)
+@lru_cache(maxsize=1024)
 def bank(half_width: float, blur: float, inside: int, grid: Grid) -> Float32:
     """The same bank as that of `new_bank`, kept: it takes a millisecond to make."""
     return new_bank(half_width, blur, inside, grid)

@@ -3,17 +3,29 @@
 
 #define MOST_SAMPLES 64
 
-/* The products (n, f) of every two whitened samples of sections (n, count), and 1. whitener: (count, count). */
+/* Sections are told in samples that are even and odd about their middle: (y_k + y_-k) and (y_k - y_-k), over the root of
+   two, the middle one as it is. What treats left and right alike then mixes none of the one with any of the other. */
+int64_t even_samples(int64_t count) { return (count + 1) / 2; }
+int64_t even_features(int64_t count) {
+  int64_t even = even_samples(count), odd = count - even;
+  return even * (even + 1) / 2 + odd * (odd + 1) / 2 + 1;
+}
+int64_t features(int64_t count) { return count * (count + 1) / 2 + 1; }
+
+/* The products (n, f) of every two samples, whitened, even and odd, of sections (n, count), and 1.
+
+   First those that stay as they are where left and right change places (of two even ones, of two odd ones, and 1), then
+   those that change their sign. whitener: (count, count), to even samples and then to odd ones. */
 EXPORT void products(const double *sections, int64_t n, int64_t count, const double *whitener, float *out) {
-  int64_t width = count * (count + 1) / 2 + 1;
+  int64_t even = even_samples(count);
   for (int64_t i = 0; i < n; i++) {
     const double *section = sections + i * count;
     double sorted[MOST_SAMPLES], centered[MOST_SAMPLES];
-    float white[MOST_SAMPLES];
+    float white[MOST_SAMPLES], *at = out + i * features(count);
     for (int64_t k = 0; k < count; k++) {
-      int64_t at = k;
-      while (at > 0 && sorted[at - 1] > section[k]) sorted[at] = sorted[at - 1], at--;
-      sorted[at] = section[k];
+      int64_t place = k;
+      while (place > 0 && sorted[place - 1] > section[k]) sorted[place] = sorted[place - 1], place--;
+      sorted[place] = section[k];
     }
     double median = count % 2 ? sorted[count / 2] : (sorted[count / 2 - 1] + sorted[count / 2]) / 2;
     for (int64_t k = 0; k < count; k++) centered[k] = section[k] - median;
@@ -22,12 +34,13 @@ EXPORT void products(const double *sections, int64_t n, int64_t count, const dou
       for (int64_t j = 0; j < count; j++) sum += whitener[k * count + j] * centered[j];
       white[k] = (float)sum;
     }
-    float *row = out + i * width;
-    for (int64_t k = 0; k < count; k++) {
-      for (int64_t j = k; j < count; j++) row[j - k] = white[k] * white[j];
-      row += count - k;
-    }
-    *row = 1;
+    for (int64_t k = 0; k < even; at += even - k++)
+      for (int64_t j = k; j < even; j++) at[j - k] = white[k] * white[j];
+    for (int64_t k = even; k < count; at += count - k++)
+      for (int64_t j = k; j < count; j++) at[j - k] = white[k] * white[j];
+    *at++ = 1;
+    for (int64_t k = 0; k < even; k++, at += count - even)
+      for (int64_t j = even; j < count; j++) at[j - even] = white[k] * white[j];
   }
 }
 
@@ -76,14 +89,97 @@ EXPORT void evidence_weights(const double *covariances, int64_t n, int64_t count
         double factor = half[k * count + i];
         for (int64_t j = i; j <= k; j++) inverse[i * count + j] += factor * half[k * count + j];
       }
-    float *row = out + each * (count * (count + 1) / 2 + 1);
-    for (int64_t i = 0; i < count; i++) {
-      row[0] = (float)(-0.5 * inverse[i * count + i]);
-      for (int64_t j = i + 1; j < count; j++) row[j - i] = (float)-inverse[i * count + j];
-      row += count - i;
-    }
-    *row = (float)-log_determinant;
+    int64_t even = even_samples(count);
+    float *at = out + each * features(count);
+    for (int64_t i = 0; i < count; i++)
+      for (int64_t j = i, last = i < even ? even : count; j < last; j++)
+        *at++ = (float)(i == j ? -0.5 * inverse[i * count + i] : -inverse[i * count + j]);
+    *at++ = (float)-log_determinant;
+    for (int64_t i = 0; i < even; i++)
+      for (int64_t j = even; j < count; j++) *at++ = (float)-inverse[i * count + j];
   }
+}
+
+#ifdef __AVX__
+#define LANES 8
+#else
+#define LANES 4
+#endif
+typedef float Lanes __attribute__((vector_size(4 * LANES)));
+
+/* `high` rows (a constant, so that all sums stay in registers) and the sixteen columns of a panel of a product. */
+static inline __attribute__((always_inline)) void tile(int high, const float *a, int64_t stride, int64_t k,
+                                                       const float *panel, float (*out)[16]) {
+  for (int half = 0; half < 16; half += 2 * LANES) {
+    Lanes sum[6][2], one, two;
+    for (int r = 0; r < high; r++) sum[r][0] = sum[r][1] = (Lanes){0};
+    for (int64_t i = 0; i < k; i++) {
+      memcpy(&one, panel + 16 * i + half, sizeof one);
+      memcpy(&two, panel + 16 * i + half + LANES, sizeof two);
+      for (int r = 0; r < high; r++) {
+        float left = a[r * stride + i];
+        sum[r][0] += left * one, sum[r][1] += left * two;
+      }
+    }
+    for (int r = 0; r < high; r++) {
+      memcpy(out[r] + half, &sum[r][0], sizeof one);
+      memcpy(out[r] + half + LANES, &sum[r][1], sizeof two);
+    }
+  }
+}
+
+/* out (n, c) = a (n, k) b (k, c), six rows and sixteen columns at a time; rows of a are `stride` apart; b in panels
+   (c / 16, k, 16), filled up. */
+static void multiply(const float *a, int64_t n, int64_t stride, int64_t k, const float *panels, int64_t c, float *out) {
+  for (int64_t column = 0; column < c; column += 16, panels += 16 * k) {
+    int64_t wide = c - column < 16 ? c - column : 16;
+    for (int64_t row = 0; row < n; row += 6) {
+      const float *left = a + row * stride;
+      float sums[6][16];
+      int64_t high = n - row < 6 ? n - row : 6;
+      switch (high) {
+        case 1: tile(1, left, stride, k, panels, sums); break;
+        case 2: tile(2, left, stride, k, panels, sums); break;
+        case 3: tile(3, left, stride, k, panels, sums); break;
+        case 4: tile(4, left, stride, k, panels, sums); break;
+        case 5: tile(5, left, stride, k, panels, sums); break;
+        default: tile(6, left, stride, k, panels, sums);
+      }
+      for (int64_t r = 0; r < high; r++)
+        memcpy(out + (row + r) * c + column, sums[r], (size_t)wide * sizeof(float));
+    }
+  }
+}
+
+/* Columns of a bank, two of each of `places` shifts, as of a section and of its mirror image. */
+static int64_t padded(int64_t columns) { return (columns + 15) / 16 * 16; }
+
+/* Log evidence (n, c) of what a bank holds, and of its mirror images, for `products` (n, f) of sections of `count`.
+
+   bank: of c columns, in panels, the rows of even products and then those of odd ones. work: (2, n, c). */
+static void both_ways(const float *shown, int64_t n, int64_t count, const float *bank, int64_t c, float *ahead,
+                      float *mirrored, float *work) {
+  int64_t even = even_features(count), all = features(count);
+  float *one = work, *other = work + n * c;
+  multiply(shown, n, all, even, bank, c, one);
+  multiply(shown + even, n, all, all - even, bank + even * padded(c), c, other);
+  for (int64_t k = 0; k < n * c; k++) ahead[k] = one[k] + other[k], mirrored[k] = one[k] - other[k];
+}
+
+/* Log evidence (n, 2 (2 p - 1)) of the axis at each shift, first before one kind of background, then before the other.
+
+   bank: of shifts 0 .. p - 1 of either kind. work: (4, n, 2 p). */
+EXPORT void by_background(const float *shown, int64_t n, int64_t count, const float *bank, int64_t p, float *out,
+                          float *work) {
+  int64_t c = 2 * p, s = 2 * p - 1;
+  float *ahead = work, *mirrored = ahead + n * c;
+  both_ways(shown, n, count, bank, c, ahead, mirrored, mirrored + n * c);
+  for (int64_t i = 0; i < n; i++)
+    for (int64_t kind = 0; kind < 2; kind++) {
+      const float *here = ahead + i * c + kind * p, *there = mirrored + i * c + kind * p;
+      float *row = out + 2 * i * s + kind * s + p - 1;
+      for (int64_t k = 0; k < p; k++) row[-k] = there[k], row[k] = here[k];
+    }
 }
 
 /* Log evidence (n, s) of one or the other of two (n, s) each that lie in one array, row by row; see `either`. */
@@ -97,17 +193,24 @@ EXPORT void either_of_both(const float *both, int64_t n, int64_t s, float *out) 
   }
 }
 
-/* Log evidence (n,) of background alone, or of one edge between two, which may be anywhere: each before both kinds of
-   background, in one array (n, 2 + 2 edges). */
-EXPORT void no_needle(const float *each, int64_t n, int64_t edges, double *out) {
+/* Log evidence (n,) of background alone, or of one edge between two, which may be anywhere.
+
+   bank: of background alone, before both kinds of it, and of an edge at shifts 0 .. p - 1 of either kind. work: room for
+   4 n (2 + 2 p). */
+EXPORT void no_needle(const float *shown, int64_t n, int64_t count, const float *bank, int64_t p, double *out,
+                      float *work) {
+  int64_t c = 2 + 2 * p, edges = 2 * p - 1;
+  float *ahead = work, *mirrored = ahead + n * c;
+  both_ways(shown, n, count, bank, c, ahead, mirrored, mirrored + n * c);
   for (int64_t i = 0; i < n; i++) {
-    const float *flat = each + 2 * i * (1 + edges), *one = flat + 2, *other = one + edges;
-    float most = flat[0] > flat[1] ? flat[0] : flat[1];
-    double alone = (double)most + log_one_plus_exp_negative(fabsf(flat[0] - flat[1]));
+    const float *one = ahead + i * c, *other = mirrored + i * c;
+    float most = one[0] > one[1] ? one[0] : one[1];
+    double alone = (double)most + log_one_plus_exp_negative(fabsf(one[0] - one[1]));
     float any[2 * MOST_SAMPLES], likeliest = -INFINITY;
     for (int64_t k = 0; k < edges; k++) {
-      float more = one[k] > other[k] ? one[k] : other[k];
-      any[k] = more + log_one_plus_exp_negative(fabsf(one[k] - other[k]));
+      const float *side = k < p ? one + 2 + k : other + 2 + k - p + 1;
+      float even = side[0], clutter = side[p], more = even > clutter ? even : clutter;
+      any[k] = more + log_one_plus_exp_negative(fabsf(even - clutter));
     }
     for (int64_t k = 0; k < edges; k++) likeliest = any[k] > likeliest ? any[k] : likeliest;
     double sum = 0;

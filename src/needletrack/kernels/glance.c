@@ -148,56 +148,6 @@ static void go_on(const double *points, int64_t n, int64_t count, double spacing
   }
 }
 
-#ifdef __AVX__
-#define LANES 8
-#else
-#define LANES 4
-#endif
-typedef float Lanes __attribute__((vector_size(4 * LANES)));
-
-/* `high` rows (a constant, so that all sums stay in registers) and the sixteen columns of a panel of a product. */
-static inline __attribute__((always_inline)) void tile(int high, const float *a, int64_t k, const float *panel,
-                                                       float (*out)[16]) {
-  for (int half = 0; half < 16; half += 2 * LANES) {
-    Lanes sum[6][2], one, two;
-    for (int r = 0; r < high; r++) sum[r][0] = sum[r][1] = (Lanes){0};
-    for (int64_t i = 0; i < k; i++) {
-      memcpy(&one, panel + 16 * i + half, sizeof one);
-      memcpy(&two, panel + 16 * i + half + LANES, sizeof two);
-      for (int r = 0; r < high; r++) {
-        float left = a[r * k + i];
-        sum[r][0] += left * one, sum[r][1] += left * two;
-      }
-    }
-    for (int r = 0; r < high; r++) {
-      memcpy(out[r] + half, &sum[r][0], sizeof one);
-      memcpy(out[r] + half + LANES, &sum[r][1], sizeof two);
-    }
-  }
-}
-
-/* out (n, c) = a (n, k) b (k, c), six rows and sixteen columns at a time; b in panels (c / 16, k, 16), filled up. */
-static void multiply(const float *a, int64_t n, int64_t k, const float *panels, int64_t c, float *out) {
-  for (int64_t column = 0; column < c; column += 16, panels += 16 * k) {
-    int64_t wide = c - column < 16 ? c - column : 16;
-    for (int64_t row = 0; row < n; row += 6) {
-      const float *left = a + row * k;
-      float sums[6][16];
-      int64_t high = n - row < 6 ? n - row : 6;
-      switch (high) {
-        case 1: tile(1, left, k, panels, sums); break;
-        case 2: tile(2, left, k, panels, sums); break;
-        case 3: tile(3, left, k, panels, sums); break;
-        case 4: tile(4, left, k, panels, sums); break;
-        case 5: tile(5, left, k, panels, sums); break;
-        default: tile(6, left, k, panels, sums);
-      }
-      for (int64_t r = 0; r < high; r++)
-        memcpy(out + (row + r) * c + column, sums[r], (size_t)wide * sizeof(float));
-    }
-  }
-}
-
 static void posed(const Camera *c, const double *points, int64_t n, double *local) {
   const double *r = c->rotation, *t = c->translation_mm;
   for (int64_t i = 0; i < n; i++) {
@@ -239,11 +189,11 @@ static void tapered(const Glance *g, const double *before_tip, int64_t n, int64_
 }
 
 static int tell(const Glance *g, const Eye *eye, const double *local, int64_t n, const int64_t *width, Told *t) {
-  int64_t places = g->places, f = places * (places + 1) / 2 + 1, s = g->shifts, c = 2 * s;
+  int64_t places = g->places, f = features(places), s = g->shifts, p = (s + 1) / 2, most = 4 * p > 4 + 4 * g->edges ? 2 * p : 2 + 2 * g->edges;
   size_t mark = arena.used;
   double *work = TAKE(double, g->rows_per_section * n * (7 + places)), *none = TAKE(double, n),
          *log = TAKE(double, n * s);
-  float *shown = TAKE(float, n * f), *both = TAKE(float, n * c), *nothing = TAKE(float, n * (2 + 2 * g->edges));
+  float *shown = TAKE(float, n * f), *both = TAKE(float, 2 * n * s), *spare = TAKE(float, 4 * n * most);
   uint8_t *cluttered = TAKE(uint8_t, n);
   double *half = TAKE(double, n), *axis = TAKE(double, n), *streak_work = TAKE(double, (3 * places + 1) * n);
   if (!streak_work) return NO_MEMORY;
@@ -258,8 +208,7 @@ static int tell(const Glance *g, const Eye *eye, const double *local, int64_t n,
   }
   if (white >= g->white_share * all && white > 0) return CLIPPED;
   products(t->values, n, places, g->whitener, shown);
-  multiply(shown, n, f, g->none_bank, 2 + 2 * g->edges, nothing);
-  no_needle(nothing, n, g->edges, none);
+  no_needle(shown, n, places, g->none_bank, g->edges, none, spare);
   for (int64_t first = 0, last; first < n; first = last) {
     for (last = first + 1; last < n && width[last] == width[first];) last++;
     if (width[first] < 0) {
@@ -267,7 +216,7 @@ static int tell(const Glance *g, const Eye *eye, const double *local, int64_t n,
       memset(cluttered + first, 0, (size_t)(last - first));
       continue;
     }
-    multiply(shown + first * f, last - first, f, g->banks[width[first]], c, both);
+    by_background(shown + first * f, last - first, places, g->banks[width[first]], p, both, spare);
     over_none(both, none + first, last - first, s, log + first * s, cluttered + first);
   }
   prepared(log, n, s, g->refine, g->fine_shifts, g->never, (float)g->outlier, t->most, t->relative, t->likelihood);

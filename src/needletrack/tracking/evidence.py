@@ -80,10 +80,11 @@ def products(sections: Float) -> Float32:
 
     A misfit is a quadratic form in a section: as one row of a matrix product it costs half of what whitening does, and
     leaves nothing to square and sum. Samples are first whitened as if there were background alone: what misfits have in
-    common, which is a thousand times what tells them apart, would else leave single precision nothing.
+    common, which is a thousand times what tells them apart, would else leave single precision nothing. And they are
+    split into what is even and what is odd about the middle: one product then serves a shift and its mirror image.
     """
     contiguous = np.ascontiguousarray(sections, dtype=np.float64)
-    shown = np.empty((len(contiguous), len(_PAIRS[0]) + 1), np.float32)
+    shown = np.empty((len(contiguous), _FEATURES), np.float32)
     call("products", contiguous, len(contiguous), len(OFFSETS), reference(), shown)
     return shown
 
@@ -95,7 +96,11 @@ def log_evidence(shown: Float32, appearance: Appearance, grid: Grid) -> Float:
 
 def log_evidence_by_background(shown: Float32, appearance: Appearance, grid: Grid) -> Float32:
     """The same (N, 2 S): before a background that is even, and then before one with clutter."""
-    return shown @ bank(float(HALF_WIDTHS[appearance.half_width]), BLURS[appearance.blur], appearance.inside, grid)
+    each = bank(float(HALF_WIDTHS[appearance.half_width]), BLURS[appearance.blur], appearance.inside, grid)
+    count, places = len(shown), grid.reach + 1
+    log = np.empty((count, 2 * len(grid.shifts)), np.float32)
+    call("by_background", shown, count, len(OFFSETS), each, places, log, np.empty(8 * count * places, np.float32))
+    return log
 
 
 def log_evidence_of_no_needle(shown: Float32, blur: int) -> Float:
@@ -103,9 +108,9 @@ def log_evidence_of_no_needle(shown: Float32, blur: int) -> Float:
 
     The edge is that of something wide: of a sleeve, a rod, a vessel beside the curve. It may be anywhere.
     """
-    each = shown @ no_needle_bank(BLURS[blur])
-    log = np.empty(len(shown))
-    call("no_needle", each, len(shown), each.shape[1] // len(_BACKGROUND_WANDER) - 1, log)
+    count, log = len(shown), np.empty(len(shown))
+    work = np.empty(8 * count * (1 + EDGES), np.float32)
+    call("no_needle", shown, count, len(OFFSETS), no_needle_bank(BLURS[blur]), EDGES, log, work)
     return log
 
 
@@ -128,19 +133,24 @@ def over_none(by_background: Float32, none: Float) -> tuple[Float, Mask]:
     return log, cluttered
 
 
-_PAIRS = np.triu_indices(len(OFFSETS))
-# Where the product of two samples is that of their mirror images.
-_PLACE = np.zeros((len(OFFSETS), len(OFFSETS)), np.int64)
-_PLACE[_PAIRS] = np.arange(len(_PAIRS[0]))
-_MIRRORED = np.append(_PLACE[::-1, ::-1].T[_PAIRS], len(_PAIRS[0]))
+# Products of two of the even samples or of two of the odd ones, and 1; and all of them.
+_EVEN = (len(OFFSETS) + 1) // 2
+_EVEN_FEATURES = _EVEN * (_EVEN + 1) // 2 + (len(OFFSETS) - _EVEN) * (len(OFFSETS) - _EVEN + 1) // 2 + 1
+_FEATURES = len(OFFSETS) * (len(OFFSETS) + 1) // 2 + 1
+# Edges are tried at every sample but the outermost two: so many, and their mirror images.
+EDGES = _EVEN - 2
 
 
 @lru_cache(maxsize=1)
 def reference() -> Float:
-    """The symmetric matrix that whitens background that wanders least; it treats left and right alike."""
-    covariance = _covariances(OFFSETS[None], 0.0, BLURS[0], 0)[0, 0] + np.eye(len(OFFSETS))
+    """What whitens background that wanders least, and leaves even samples, then odd ones (n, n) of a section (n,)."""
+    n = len(OFFSETS)
+    covariance = _covariances(OFFSETS[None], 0.0, BLURS[0], 0)[0, 0] + np.eye(n)
     values, vectors = np.linalg.eigh((covariance + covariance[::-1, ::-1]) / 2)
-    return np.asarray((vectors / np.sqrt(values)) @ vectors.T)
+    white = (vectors / np.sqrt(values)) @ vectors.T
+    even = (white + white[::-1])[:_EVEN] / np.sqrt(2)
+    even[-1] /= np.sqrt(2)
+    return np.ascontiguousarray(np.concatenate([even, (white - white[::-1])[: n - _EVEN] / np.sqrt(2)]))
 
 
 @lru_cache(maxsize=1024)
@@ -152,7 +162,8 @@ def bank(half_width: float, blur: float, inside: int, grid: Grid) -> Float32:
 def new_bank(half_width: float, blur: float, inside: int, grid: Grid) -> Float32:
     """The hypotheses of one half width at every shift of the grid; of 0: of background alone, without shifts.
 
-    They are the weights (F, kinds * shifts) of `products` in their log evidence.
+    They are the weights of `products` in the log evidence of each kind and of shifts from 0 on, as `_as_bank` lays
+    them out; shifts the other way are the mirror images.
     """
     extra = grid.reach // grid.substeps + 1
     n = len(OFFSETS)
@@ -163,30 +174,36 @@ def new_bank(half_width: float, blur: float, inside: int, grid: Grid) -> Float32
     for shift in range(grid.reach + 1):
         whole, rest = divmod(shift, grid.substeps)
         covariances[:, shift] = seen[rest, :, extra - whole : extra - whole + n, extra - whole : extra - whole + n]
-    weights = _weights(covariances)
-    # Shifts the other way are the mirror images.
-    return _as_bank(np.concatenate([weights[:, :0:-1, _MIRRORED], weights], axis=1))
+    return _as_bank(_weights(covariances).reshape(-1, _FEATURES))
 
 
 @lru_cache(maxsize=64)
 def no_needle_bank(blur: float) -> Float32:
-    """Background alone, then a single edge at every sample but the outermost ones."""
-    edges = _covariances(OFFSETS - OFFSETS[2:-2, None], _EDGE_HALF_WIDTH, blur, 0).swapaxes(0, 1)
-    return np.hstack([bank(0.0, blur, 0, _HERE), _as_bank(_weights(edges))])
+    """Background alone, then a single edge at every sample from the middle on but the outermost ones."""
+    alone = _covariances(OFFSETS[None], 0.0, blur, 0)
+    edges = _covariances(OFFSETS - np.arange(EDGES)[:, None] * ACROSS_STEP, _EDGE_HALF_WIDTH, blur, 0)
+    every = np.concatenate([alone.swapaxes(0, 1), edges.swapaxes(0, 1)], axis=1)
+    weights = _weights(every)
+    return _as_bank(np.concatenate([weights[:, 0], weights[:, 1:].reshape(-1, _FEATURES)]))
 
 
 def _as_bank(weights: Float32) -> Float32:
-    """Weights (kinds, shifts, F) as columns (F, kinds * shifts)."""
-    return np.ascontiguousarray(weights.reshape(-1, weights.shape[-1]).T)
+    """Weights (C, F) as the kernels multiply by them: sixteen columns at a time, of even products and then of odd."""
+    columns = np.zeros((_FEATURES, -(-len(weights) // 16) * 16), np.float32)
+    columns[:, : len(weights)] = weights.T
+    panels = [
+        part.reshape(len(part), -1, 16).swapaxes(0, 1) for part in (columns[:_EVEN_FEATURES], columns[_EVEN_FEATURES:])
+    ]
+    return np.concatenate([panel.ravel() for panel in panels])
 
 
 def _weights(covariances: Float) -> Float32:
     """The weights (..., F) of `products` in log evidence; covariances (..., n, n) are of what is seen but for noise."""
     contiguous = np.ascontiguousarray(covariances)
     n = contiguous.shape[-1]
-    weights = np.empty((*contiguous.shape[:-2], len(_PAIRS[0]) + 1), np.float32)
+    weights = np.empty((*contiguous.shape[:-2], _FEATURES), np.float32)
     call("evidence_weights", contiguous, contiguous.size // n**2, n, reference(), weights)
-    weights[..., -1] += np.linalg.slogdet(reference())[1]
+    weights[..., _EVEN_FEATURES - 1] += np.linalg.slogdet(reference())[1]
     return weights
 
 

@@ -28,7 +28,17 @@ from needletrack.tracking.ends import (
     TIP_BEYOND_MM,
     EndsParameters,
 )
-from needletrack.tracking.evidence import BLURS, HALF_WIDTHS, LIVELY, OFFSETS, Grid, new_bank, no_needle_bank, reference
+from needletrack.tracking.evidence import (
+    BLURS,
+    EDGES,
+    HALF_WIDTHS,
+    LIVELY,
+    OFFSETS,
+    Grid,
+    new_bank,
+    no_needle_bank,
+    reference,
+)
 from needletrack.tracking.fit import ROBUST_SIGMAS, ROUNDS, CurveFit, FitParameters, priors
 from needletrack.tracking.needle import Needle
 from needletrack.tracking.profile import EDGE_SPREAD_PX, FLANK_PX, Mask
@@ -353,18 +363,10 @@ class _Room:
         return Glance(fit, self._shown[:, :count], self._support[:, :count], tip, bool(record.is_free), tip_px)
 
 
-def _panels(weights: Array) -> Array:
-    """A matrix (K, C) as the kernel multiplies by it: sixteen columns at a time, (ceil(C / 16), K, 16)."""
-    rows, columns = weights.shape
-    padded = np.zeros((rows, -(-columns // 16) * 16), np.float32)
-    padded[:, :columns] = weights
-    return np.ascontiguousarray(padded.reshape(rows, -1, 16).swapaxes(0, 1))
-
-
 @lru_cache(maxsize=64)
 def _bank(half_width: int, blur: int, inside: int, grid: Grid) -> Array:
     """A bank by the indices of its half width, blur and inside."""
-    return _panels(new_bank(float(HALF_WIDTHS[half_width]), BLURS[blur], inside, grid))
+    return new_bank(float(HALF_WIDTHS[half_width]), BLURS[blur], inside, grid)
 
 
 @lru_cache(maxsize=16)
@@ -384,7 +386,6 @@ def _wanted(parameters: GlanceParameters, appearance: Appearance) -> tuple[_Glan
         kept.append(array)
         return address(array)
 
-    none_bank = no_needle_bank(blur)
     return _Glance(
         white_gray=CLIPPED_GRAY,
         white_share=WORTH_A_LOOK,
@@ -406,8 +407,8 @@ def _wanted(parameters: GlanceParameters, appearance: Appearance) -> tuple[_Glan
         half_width=appearance.half_width,
         width_step=_WIDTH_STEP,
         banks=address(banks),
-        none_bank=at(_panels(none_bank)),
-        edges=none_bank.shape[1] // 2 - 1,
+        none_bank=at(no_needle_bank(blur)),
+        edges=EDGES,
         shifts=len(grid.shifts),
         fine_shifts=len(grid.fine_shifts),
         low=grid.shifts[0],

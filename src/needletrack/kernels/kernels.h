@@ -8,6 +8,9 @@
 
 #define EXPORT __attribute__((visibility("default")))
 
+/* Control points of a spline at most. */
+#define MOST_CONTROL 30
+
 /* As `needletrack.kernels.Lens` lays it out: all doubles. camera_from_world = [rotation | translation_mm]. */
 typedef struct {
   double fx, fy, cx, cy, skew;

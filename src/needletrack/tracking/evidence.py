@@ -8,14 +8,14 @@ contrast leaves it to the other one, and a section without either says so by a f
 """
 
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import cache, cached_property, lru_cache
 
 import numpy as np
 import numpy.typing as npt
 from scipy.interpolate import CubicSpline
 from scipy.special import ndtr
 
-from needletrack.kernels import call
+from needletrack.kernels import address, call
 from needletrack.records import Appearance, Float
 
 Float32 = npt.NDArray[np.float32]
@@ -96,7 +96,7 @@ def log_evidence(shown: Float32, appearance: Appearance, grid: Grid) -> Float:
 
 def log_evidence_by_background(shown: Float32, appearance: Appearance, grid: Grid) -> Float32:
     """The same (N, 2 S): before a background that is even, and then before one with clutter."""
-    each = bank(float(HALF_WIDTHS[appearance.half_width]), BLURS[appearance.blur], appearance.inside, grid)
+    each = banks(grid).bank(appearance.inside, appearance.blur, appearance.half_width)
     count, places = len(shown), grid.reach + 1
     log = np.empty((count, 2 * len(grid.shifts)), np.float32)
     call("by_background", shown, count, len(OFFSETS), each, places, log, np.empty(8 * count * places, np.float32))
@@ -153,10 +153,31 @@ def reference() -> Float:
     return np.ascontiguousarray(np.concatenate([even, (white - white[::-1])[: n - _EVEN] / np.sqrt(2)]))
 
 
-@lru_cache(maxsize=1024)
-def bank(half_width: float, blur: float, inside: int, grid: Grid) -> Float32:
-    """The same bank as that of `new_bank`, kept: it takes a millisecond to make."""
-    return new_bank(half_width, blur, inside, grid)
+class Banks:
+    """The banks of a grid, each made when it is first wanted, which takes a millisecond, and kept.
+
+    addresses (insides, BLURS, HALF_WIDTHS): where each lies, as the kernels take them; 0 where it was not made.
+    """
+
+    def __init__(self, grid: Grid) -> None:
+        self._grid = grid
+        self._made: dict[tuple[int, int, int], Float32] = {}
+        self.addresses = np.zeros((len(INSIDES), len(BLURS), len(HALF_WIDTHS)), np.uintp)
+
+    def bank(self, inside: int, blur: int, half_width: int) -> Float32:
+        """The bank of an inside, a blur and a half width, by their indices."""
+        key = (inside, blur, half_width)
+        if key not in self._made:
+            # The first of two threads that make it wins: the other's address may be in use already.
+            made = self._made.setdefault(key, new_bank(float(HALF_WIDTHS[half_width]), BLURS[blur], inside, self._grid))
+            self.addresses[key] = address(made)
+        return self._made[key]
+
+
+@cache
+def banks(grid: Grid) -> Banks:
+    """The banks of a grid."""
+    return Banks(grid)
 
 
 def new_bank(half_width: float, blur: float, inside: int, grid: Grid) -> Float32:
@@ -177,7 +198,7 @@ def new_bank(half_width: float, blur: float, inside: int, grid: Grid) -> Float32
     return _as_bank(_weights(covariances).reshape(-1, _FEATURES))
 
 
-@lru_cache(maxsize=64)
+@cache
 def no_needle_bank(blur: float) -> Float32:
     """Background alone, then a single edge at every sample from the middle on but the outermost ones."""
     alone = _covariances(OFFSETS[None], 0.0, blur, 0)
@@ -185,6 +206,12 @@ def no_needle_bank(blur: float) -> Float32:
     every = np.concatenate([alone.swapaxes(0, 1), edges.swapaxes(0, 1)], axis=1)
     weights = _weights(every)
     return _as_bank(np.concatenate([weights[:, 0], weights[:, 1:].reshape(-1, _FEATURES)]))
+
+
+@cache
+def no_needle_addresses() -> npt.NDArray[np.uintp]:
+    """Where the bank of no needle of each of BLURS lies (len(BLURS),), as the kernels take them."""
+    return np.array([address(no_needle_bank(blur)) for blur in BLURS], np.uintp)
 
 
 def _as_bank(weights: Float32) -> Float32:

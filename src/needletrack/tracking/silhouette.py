@@ -23,11 +23,11 @@ from needletrack.tracking.evidence import (
     WIDE,
     Float32,
     Grid,
-    bank,
+    banks,
     log_evidence,
     log_evidence_by_background,
     log_evidence_of_no_needle,
-    no_needle_bank,
+    no_needle_addresses,
     over_none,
     products,
 )
@@ -46,7 +46,7 @@ LOG_OUTLIER = -12.0
 OUTLIER = float(np.exp(LOG_OUTLIER))
 LOG_NEVER = -1e4
 # Log odds against the axis turning aside from a nearly right curve, per unit.
-_TURN_PRICE = 6.0
+TURN_PRICE = 6.0
 # Differences between the motions of the two ends that are tried, units; log odds against a motion, per unit squared.
 DRIFTS = np.linspace(-4.0, 4.0, 17)
 MOTION_PRICE = 1.0
@@ -184,11 +184,11 @@ def _looks(needle: Needle, px_per_unit: float) -> tuple[list[int], list[int]]:
 def make_banks(needle: Needle, px_per_unit: float) -> None:
     """Make what every look of a needle is tried with: a third of a second, which no pair should wait for."""
     widths, blurs = _looks(needle, px_per_unit)
+    no_needle_addresses()
     for blur in blurs:
-        no_needle_bank(BLURS[blur])
         for width in widths:
             for inside in (DULL, LIVELY):
-                bank(float(HALF_WIDTHS[width]), BLURS[blur], inside, WIDE)
+                banks(WIDE).bank(inside, blur, width)
 
 
 def estimate_appearance(
@@ -297,7 +297,7 @@ class AxisEvidence:
     def likeliest_path_px(self) -> Float:
         """Offsets (N,) px of the likeliest axis from end to end, which may turn aside, at a price (Viterbi 1967)."""
         shifts = self.grid.shifts
-        path = likeliest_path(self._floored, _TURN_PRICE * float(shifts[1] - shifts[0]))
+        path = likeliest_path(self._floored, TURN_PRICE * float(shifts[1] - shifts[0]))
         return np.asarray(shifts[path] * self.sections.px_per_unit)
 
     def likeliest_motion_px(self) -> Float:

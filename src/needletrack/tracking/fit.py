@@ -211,7 +211,7 @@ class CurveFitting:
     """Fits about one predicted curve (N, 3) and the sections across it, one after another: see `fit_curve`.
 
     streaks: of light, which run beside the axis. bent_for_s: the curve is where the needle was so long ago, and it
-    bends now much as it did then; None: it is not.
+    bends now much as it did then; None: it is not. begun: a fit about the same curve to go on from.
     """
 
     def __init__(
@@ -223,6 +223,7 @@ class CurveFitting:
         *,
         streaks: Streaks = (None, None),
         bent_for_s: float | None = None,
+        begun: CurveFit | None = None,
     ) -> None:
         self._parameters = parameters
         self._points_mm = np.ascontiguousarray(points_mm)
@@ -249,7 +250,7 @@ class CurveFitting:
         )
         if failed:
             raise NeedleNotFound("fit", Reason.HIGH_UNCERTAINTY)
-        self._control = self._start.copy()
+        self._control = (self._start if begun is None else begun.control_mm).copy()
         self._share = min(1.0, whole / (len(points_mm) - 1) / parameters.correlation_mm)
         self._sights = two_sights()
         self._views = [

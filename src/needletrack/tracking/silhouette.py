@@ -5,13 +5,16 @@ evidence (`evidence.py`) tells how likely the axis is at each offset, given the 
 Diameter, blur of the lens and liveliness of the inside are the same all along the needle and are found first.
 """
 
+import ctypes
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any, ClassVar
 
 import numpy as np
 
 from needletrack.geometry.camera import Camera
-from needletrack.kernels import call
+from needletrack.kernels import address, call
 from needletrack.records import Appearance, Float, Image, Int
 from needletrack.tracking.evidence import (
     BLURS,
@@ -24,7 +27,6 @@ from needletrack.tracking.evidence import (
     Float32,
     Grid,
     banks,
-    log_evidence,
     log_evidence_by_background,
     log_evidence_of_no_needle,
     no_needle_addresses,
@@ -57,13 +59,14 @@ CLUTTERED = 2.0
 # A section that narrows the expectation by less than this share tells nothing.
 LEAST_GAIN = 0.3
 # So many sections of each view decide on the appearance; a section has at most so much of a say.
-_DECIDING = 16
+DECIDING = 16
 # An inside is lively where this share of sections says so, by this much each, and the others do not deny it: where
 # nothing shines, a dull one is likelier by two or more.
 _LIVELY_SHARE, _LIVELY_SAY, _DULL_SAY = 0.05, 4.0, -1.5
 _MOST_SAY = 40.0
 # Blurs of lenses in and nearly in focus, px; diameters are looked for a little beyond those in use: saturation widens.
 _BLURS_PX = (0.45, 1.1)
+_BLURS = np.array(BLURS)
 _DIAMETER_MARGIN = (0.9, 1.3)
 
 
@@ -191,55 +194,96 @@ def make_banks(needle: Needle, px_per_unit: float) -> None:
                 banks(WIDE).bank(inside, blur, width)
 
 
+class Looks(ctypes.Structure):
+    """What a needle may look like, as `adjust.c` lays it out."""
+
+    _fields_: ClassVar[Sequence[tuple[str, Any]]] = [
+        ("banks", ctypes.c_void_p),
+        ("wanted", ctypes.c_void_p),
+        ("blurs", ctypes.c_int64),
+        ("widths", ctypes.c_int64),
+        ("first_width", ctypes.c_int64),
+        ("last_width", ctypes.c_int64),
+        ("samples", ctypes.c_int64),
+        ("places", ctypes.c_int64),
+        ("reached", ctypes.c_int64),
+        ("blur_units", ctypes.c_void_p),
+        ("blur_low_px", ctypes.c_double),
+        ("blur_high_px", ctypes.c_double),
+        ("most_say", ctypes.c_double),
+        ("lively_share", ctypes.c_double),
+        ("lively_say", ctypes.c_double),
+        ("dull_say", ctypes.c_double),
+    ]
+
+
+def looks_of(needle: Needle, grid: Grid, wanted: Mask) -> Looks:
+    """What a needle may look like whose axis is as far away as a grid reaches.
+
+    The coarse grid tells looks apart as well as a fine one does, and one set of banks is less to make. wanted (insides,
+    BLURS, HALF_WIDTHS): where the kernel marks the banks that it missed; the caller keeps it.
+    """
+    widths, _ = _looks(needle, 1.0)
+    return Looks(
+        banks=address(banks(WIDE).addresses),
+        wanted=address(wanted),
+        blurs=len(BLURS),
+        widths=len(HALF_WIDTHS),
+        first_width=widths[0],
+        last_width=widths[-1] + 1,
+        samples=len(OFFSETS),
+        places=WIDE.reach + 1,
+        reached=int((np.abs(WIDE.shifts) <= grid.shifts[-1]).sum()) // 2,
+        blur_units=address(_BLURS),
+        blur_low_px=_BLURS_PX[0],
+        blur_high_px=_BLURS_PX[1],
+        most_say=_MOST_SAY,
+        lively_share=_LIVELY_SHARE,
+        lively_say=_LIVELY_SAY,
+        dull_say=_DULL_SAY,
+    )
+
+
+def no_bank_wanted() -> Mask:
+    """Where a kernel marks the banks of a grid that it missed, (insides, BLURS, HALF_WIDTHS)."""
+    return np.zeros(banks(WIDE).addresses.shape, np.bool_)
+
+
+def make_wanted(grid: Grid, wanted: Mask) -> bool:
+    """Make the banks of a grid that a kernel missed; whether there are any."""
+    missed = np.argwhere(wanted).tolist()
+    for inside, blur, width in missed:
+        banks(grid).bank(inside, blur, width)
+    wanted[:] = False
+    return bool(missed)
+
+
 def estimate_appearance(
     views: tuple[Sections, Sections], needle: Needle, near: Appearance | None, grid: Grid, *, is_white: bool = False
 ) -> Appearance:
     """Diameter, blur and inside under which the sections of both views are likeliest; `near`: what they were before.
 
-    The axis may be as far away as the grid reaches; the coarse one tells looks apart as well as a fine one does, and
-    one set of banks is less to make. A white needle that saturates is dull, though its profile is cut off.
+    The axis may be as far away as the grid reaches. A white needle that saturates is dull, though its profile is cut
+    off. `adjust` does the same to the sections that it cuts.
     """
-    decisive = [np.unique(np.linspace(0, len(v.values) - 1, _DECIDING).astype(np.int64)) for v in views]
-    shown = products(np.concatenate([view.values[pick] for view, pick in zip(views, decisive, strict=True)]))
+    decisive = [np.arange(DECIDING) * (len(v.values) - 1) // (DECIDING - 1) for v in views]
+    picked = [view.values[np.unique(at)] for view, at in zip(views, decisive, strict=True)]
+    shown = products(np.concatenate(picked))
     px_per_unit = float(np.median(np.concatenate([view.px_per_unit for view in views])))
-    widths, blurs = _looks(needle, px_per_unit)
-    likely: dict[Appearance, Float] = {}
-    within = np.flatnonzero(np.abs(WIDE.shifts) <= grid.shifts[-1])
-    reached = slice(int(within[0]), int(within[-1]) + 1)
+    wanted = no_bank_wanted()
+    looks = looks_of(needle, grid, wanted)
+    found = as_look(near)
+    while call("appearance_of", looks, shown, len(shown), px_per_unit, 1 if is_white else 2, found):
+        if not make_wanted(WIDE, wanted):
+            raise MemoryError("there is no memory for the kernel that tells what a needle looks like")
+    return Appearance(*found.tolist())
 
-    def best(tried: list[Appearance]) -> Appearance:
-        for each in tried:
-            if each not in likely:
-                likely[each] = log_evidence(shown, each, WIDE)[:, reached].max(axis=1)
-        table = np.stack([likely[each] for each in tried], axis=1)
-        # A section of something else has no more of a say than _MOST_SAY.
-        say = np.maximum(table - table.max(axis=1, keepdims=True), -_MOST_SAY).sum(axis=0)
-        return tried[int(np.argmax(say))]
 
-    insides = (DULL,) if is_white else (DULL, LIVELY)
-    if near is None:
-        near = best([Appearance(w, b, i) for w in widths[1::3] for b in blurs for i in insides])
-    # What is seen of a needle that is followed may look different from its first stretch. Each inside has a width and
-    # a blur of its own at which it explains the sections best.
-    each = [
-        best(
-            [
-                Appearance(w, b, inside)
-                for w in widths
-                if abs(w - near.half_width) <= 2
-                for b in blurs
-                if abs(b - near.blur) <= 1
-            ]
-        )
-        for inside in insides
-    ]
-    if is_white:
-        return each[0]
-    dull, lively = each
-    # A stretch with a streak misleads where a dull inside is taken for granted; the other way round costs little.
-    gain = likely[lively] - likely[dull]
-    streaked = float(np.mean(gain > _LIVELY_SAY)) > _LIVELY_SHARE and float(np.mean(gain)) > _DULL_SAY
-    return lively if streaked else dull
+def as_look(appearance: Appearance | None) -> Int:
+    """Half width, blur and inside (3,), as the kernels take them."""
+    if appearance is None:
+        return np.full(3, -1)
+    return np.array([appearance.half_width, appearance.blur, appearance.inside])
 
 
 @dataclass(frozen=True, eq=False)

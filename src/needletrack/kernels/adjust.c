@@ -1,51 +1,5 @@
 /* A curve that is nearly right, adjusted to both silhouettes: see `tracking/adjust.py`. */
-#include "curve.h"
-
-enum { BANK_WANTED = OTHERS };
-
-/* What a needle may look like, and how sections tell; as `adjust._Looked` lays it out. */
-typedef struct {
-  /* (2, blurs, widths): where the bank of each look lies, 0 where there is none yet; wanted: the same, marked where one
-     was asked for in vain. */
-  const float *const *banks;
-  uint8_t *wanted;
-  int64_t blurs, widths, first_width, last_width, samples, places, reached;
-  const double *blur_units;
-  double blur_low_px, blur_high_px;
-  double most_say, lively_share, lively_say, dull_say;
-} Looks;
-
-/* What is known and wanted; as `adjust._Adjust` lays it out. */
-typedef struct {
-  Axis axis;
-  Spline spline;
-  Looks looks;
-  /* Banks of the grid of the axis, as those of the looks; of no needle, by blur; and how much either inside is pulled. */
-  const float *const *banks, *const *none_banks;
-  uint8_t *wanted;
-  const double *systematic_px;
-  int64_t deciding, lively_inside;
-  double white_share;
-  int64_t expectation, with_streak, with_covariance;
-  /* The curve (n, 3); half width, blur, inside of the needle before, -1: not known; whether they are so still. */
-  const double *points_mm;
-  int64_t n, near[3], looks_the_same;
-  /* Distances (n,) from the apex of a tip that tapers over taper_mm, or null. */
-  const double *before_tip_mm;
-  double taper_mm, bent_for_s;
-  /* For each view: at which point it shows the end, if it does, how far ahead, and how well. */
-  int64_t end_index[2];
-  double end_shift_px[2], end_sigma_px[2];
-} Adjust;
-
-/* What was found, of n points in 2 views; room for MOST_CONTROL control points. */
-typedef struct {
-  double *control_mm, *covariance_mm2, *parameters, *points_mm, *residual_px, *center_px, *normal, *offset_px, *sigma_px,
-      *support, *expected_px, *streak_px, *streak_sigma_px, *px_per_unit;
-  uint8_t *shines;
-  int64_t control_count, look[3];
-  double rms_px, streak_misfit, white_shares[2];
-} Adjusted;
+#include "adjust.h"
 
 /* Scores of looks as they are asked for. */
 typedef struct {
@@ -195,7 +149,18 @@ static int estimated(const Adjust *a, const Told *told, int64_t insides, int64_t
   return failed;
 }
 
-static int adjusted(const Adjust *wanted, const Eye *eyes, Adjusted *o) {
+int room_to_adjust(int64_t n, Adjusted *o) {
+  memset(o, 0, sizeof *o);
+  o->control_mm = TAKE(double, 3 * MOST_CONTROL), o->covariance_mm2 = TAKE(double, 9 * MOST_CONTROL * MOST_CONTROL);
+  o->parameters = TAKE(double, n), o->points_mm = TAKE(double, 3 * n), o->residual_px = TAKE(double, 2 * n);
+  o->center_px = TAKE(double, 4 * n), o->normal = TAKE(double, 4 * n), o->offset_px = TAKE(double, 2 * n);
+  o->sigma_px = TAKE(double, 2 * n), o->support = TAKE(double, 2 * n), o->expected_px = TAKE(double, 2 * n);
+  o->streak_px = TAKE(double, 2 * n), o->streak_sigma_px = TAKE(double, 2 * n), o->px_per_unit = TAKE(double, 2 * n);
+  o->shines = TAKE(uint8_t, 2 * n);
+  return o->shines == 0;
+}
+
+int adjusted(const Adjust *wanted, const Eye *eyes, Adjusted *o) {
   Adjust a = *wanted;
   int64_t n = a.n, *width = TAKE(int64_t, n);
   double *arc = TAKE(double, n), *local = TAKE(double, 3 * n), *px = TAKE(double, 2 * n), ends[2][7];
@@ -278,7 +243,7 @@ static int once(void *what) {
   return adjusted(call->wanted, call->eyes, call->found);
 }
 
-/* See `adjust.adjust`. Returns BANK_WANTED where banks have to be made first: those that are marked. */
+/* See `adjust.adjust`. */
 EXPORT int adjust(const Adjust *a, const Eye *eyes, Adjusted *o) {
   Call call = {a, eyes, o};
   return with_memory(once, &call);

@@ -4,7 +4,7 @@ import ctypes
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from enum import IntEnum
-from functools import lru_cache
+from functools import cache
 from typing import Any, ClassVar
 
 import numpy as np
@@ -47,6 +47,9 @@ from needletrack.tracking.silhouette import (
 from needletrack.tracking.silhouette import Looks as KernelLooks
 
 Images = tuple[Image, Image]
+
+# What the kernel says beside what `axis.py` names: banks have to be made first, those that it marked.
+BANK_WANTED = OTHERS
 
 
 class Expectation(IntEnum):
@@ -138,8 +141,7 @@ def adjust(
     is clipped, as they were nearly. bent_for_s: the curve is that of so long ago. Raises NeedleNotFound where
     nothing holds a curve.
     """
-    template, kept, wanted = _template(needle, parameters, looks)
-    now = _Adjust.from_buffer_copy(template)
+    now = _Adjust.from_buffer_copy(adjusting(needle, parameters, looks))
     mine = Kept()
     count = len(points_mm)
     points = np.ascontiguousarray(points_mm, dtype=np.float64)
@@ -149,20 +151,19 @@ def adjust(
     if before_tip is not None:
         now.before_tip_mm, now.taper_mm = mine.at(np.ascontiguousarray(before_tip[0])), before_tip[1]
     for view, seen in enumerate(ends):
-        now.end_index[view] = -1
         for end in seen:
             now.end_index[view], now.end_shift_px[view], now.end_sigma_px[view] = end.index, end.shift_px, end.sigma_px
     found = _Room(count)
     eyes = two_eyes(images, rig, mine)
-    while (answer := call("adjust", now, eyes, found.record)) == _BANK_WANTED:
-        made = [make_wanted(grid, each) for grid, each in zip((WIDE, looks.grid), wanted, strict=True)]
-        if not any(made):
-            break
+    while (answer := call("adjust", now, eyes, found.record)) == BANK_WANTED and make_missing(
+        needle, parameters, looks
+    ):
+        pass
     if answer in (NOT_SEEN, NOT_HELD):
         raise NeedleNotFound("fit", Reason.LOW_COVERAGE if answer == NOT_SEEN else Reason.HIGH_UNCERTAINTY)
     if answer != FOUND:
         raise MemoryError("there is no memory for the kernel that adjusts a curve")
-    del kept
+    del mine
     adjusted = found.adjusted()
     if looks is not SETTLED or max(found.record.white_shares) < WORTH_A_LOOK:
         return adjusted
@@ -179,9 +180,6 @@ def adjust(
     )
     fit = fitting.fit(observed, ends, parameters.systematic_px[adjusted.appearance.inside])
     return replace(adjusted, fit=fit, observed=observed, flanks=shown)
-
-
-_BANK_WANTED = OTHERS
 
 
 class _Adjust(ctypes.Structure):
@@ -306,7 +304,22 @@ class _Room:
         return left, right
 
 
-@lru_cache(maxsize=32)
+def adjusting(needle: Needle, parameters: FitParameters, looks: Looks) -> ctypes.Structure:
+    """What the kernels that adjust a curve know beforehand, which stays where it is."""
+    return _template(needle, parameters, looks)[0]
+
+
+def make_missing(needle: Needle, parameters: FitParameters, *looks: Looks) -> bool:
+    """Make the banks that the kernels missed when they adjusted a curve by these looks; whether there were any."""
+    made = [
+        make_wanted(grid, wanted)
+        for each in looks
+        for grid, wanted in zip((WIDE, each.grid), _template(needle, parameters, each)[2], strict=True)
+    ]
+    return any(made)
+
+
+@cache
 def _template(needle: Needle, parameters: FitParameters, looks: Looks) -> tuple[_Adjust, Kept, tuple[Mask, Mask]]:
     """What does not change from curve to curve; the arrays that it points to; where it marks banks that are missed."""
     kept, wanted = Kept(), (no_bank_wanted(), no_bank_wanted())
@@ -325,6 +338,7 @@ def _template(needle: Needle, parameters: FitParameters, looks: Looks) -> tuple[
             expectation=looks.expectation,
             with_streak=looks.with_streak,
             with_covariance=looks.with_covariance,
+            end_index=(-1, -1),
         ),
         kept,
         wanted,

@@ -4,7 +4,7 @@ Works the same from a detection and from the previous track: it needs nothing bu
 """
 
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
@@ -16,7 +16,7 @@ from needletrack.geometry.spline import arc_length, resample, spline_basis, unit
 from needletrack.geometry.stereo import StereoRig
 from needletrack.geometry.transform import RigidTransform
 from needletrack.records import Appearance, Float, NeedleTrack, Reason
-from needletrack.tracking.adjust import GROWING, MOVED, ROUGH, SETTLED, Adjusted, Images, adjust
+from needletrack.tracking.adjust import MOVED, SETTLED, Adjusted, Images, adjust
 from needletrack.tracking.beside import Beside, BesideParameters, line_height_gray, look_beside
 from needletrack.tracking.ends import (
     TIP_BEFORE_MM,
@@ -28,7 +28,6 @@ from needletrack.tracking.ends import (
     is_crossed,
     needle_stretch,
 )
-from needletrack.tracking.evidence import WIDE
 from needletrack.tracking.fit import CurveFit, EndObservation, Ends, FitParameters
 from needletrack.tracking.glance import (
     ADVANCE_SIGMA_MM_S,
@@ -41,9 +40,10 @@ from needletrack.tracking.glance import (
     Steady,
     glance,
 )
+from needletrack.tracking.grow import Growth, grow
 from needletrack.tracking.needle import Needle, Positive, Workspace
 from needletrack.tracking.profile import Mask
-from needletrack.tracking.silhouette import AxisOffsets, axis_evidence, cut_sections, diameter_mm
+from needletrack.tracking.silhouette import AxisOffsets, diameter_mm
 from needletrack.tracking.tip import (
     BEFORE_MM,
     BEYOND_MM,
@@ -64,8 +64,6 @@ _MOST_ODDS = 30.0
 _TIP_MOVED_MM = 0.3
 # Where a line is looked for beyond the tip: its blur, and the error of a tip that was found, end before.
 _BEYOND_MM, _BEYOND_STEP_MM = (1.5, 6.5), 0.5
-# Less than so much that looks like more of a needle beyond an end is none.
-_GOES_ON_MM = 1.5
 # Images without stamps are of a sequence as fast as cameras are.
 _USUAL_S = 1 / 30
 # Weaknesses of a track that is followed nevertheless: its shape is that of the needle, to its end.
@@ -156,14 +154,20 @@ def refine(
     where no sleeve is seen; without it the curve is a rough one. since_s: how long ago it was taken; 0: nobody knows.
     """
     steady = None if previous is None or set(previous.reasons) - _STEADY_DESPITE else _steady(previous, since_s, models)
-    if steady is None:
-        followed = _follow(images, rig, points_mm, models, previous)
-    else:
-        followed = _moved(images, rig, steady, models)
     spacing = models.refine.spacing_mm
+    moved = None if steady is None else _moved(images, rig, steady, models)
+    if moved is None:
+        appearance = None if previous is None else previous.appearance
+        # A needle that is followed has been looked for behind bends and gaps before.
+        growth = _growth(models.refine, models.ends, is_followed=previous is not None)
+        followed_mm, appearance = grow(
+            images, rig, _even(points_mm, spacing), models.needle, models.fit, growth, appearance
+        )
+    else:
+        followed_mm, appearance = moved.fit.points_mm, moved.appearance
     margin = round(models.refine.sleeve_reach_mm / spacing)
-    extended = _extended(followed.fit.points_mm, models.refine.sleeve_reach_mm, spacing)
-    seen_diameter_mm = diameter_mm(followed.appearance, models.needle)
+    extended = _extended(followed_mm, models.refine.sleeve_reach_mm, spacing)
+    seen_diameter_mm = diameter_mm(appearance, models.needle)
     observed = _look_beside(images, rig, extended, seen_diameter_mm, models)
     stretch = needle_stretch(observed, margin, len(extended) - margin, spacing, models.ends)
     if stretch.sleeve is not None:
@@ -180,8 +184,8 @@ def refine(
     base_is_known = base is not None and not (
         stretch.sleeve is not None and _goes_on(images, rig, extended, observed, stretch, seen_diameter_mm, models)
     )
-    if steady is not None:
-        ended = _ended(images, rig, extended[stretch.start : stretch.stop], followed, models, steady)
+    if moved is not None:
+        ended = _ended(images, rig, extended[stretch.start : stretch.stop], moved, models, steady)
     else:
         adjusted = adjust(
             images,
@@ -189,7 +193,7 @@ def refine(
             _even(extended[stretch.start : stretch.stop], spacing),
             models.needle,
             models.fit,
-            followed.appearance,
+            appearance,
             looks=SETTLED,
         )
         ended = _ended(images, rig, adjusted.fit.points_mm, adjusted, models)
@@ -437,71 +441,20 @@ def _moved(images: Images, rig: StereoRig, steady: Steady, models: RefineModels)
     )
 
 
-def _follow(
-    images: Images, rig: StereoRig, points_mm: Float, models: RefineModels, previous: NeedleTrack | None
-) -> Adjusted:
-    """The curve adjusted, cut to what the views show, lengthened and adjusted again until it grows no more."""
-    spacing = models.refine.spacing_mm
-    appearance = None if previous is None else previous.appearance
-    points = _even(points_mm, spacing)
-    length_mm = 0.0
-    reaches: tuple[float, ...] = (models.refine.reach_mm, models.refine.bend_reach_mm, models.refine.gap_reach_mm)
-    # A needle that is followed has been looked for behind bends and gaps before.
-    reaches = reaches if previous is None else reaches[:1]
-    remaining, reach, looks = models.refine.max_rounds, 0, ROUGH
-    while True:
-        remaining -= 1
-        adjusted = adjust(images, rig, points, models.needle, models.fit, appearance, looks=looks)
-        appearance, looks = adjusted.appearance, GROWING
-        shown = _shown(adjusted, models)
-        if shown is None:
-            raise NeedleNotFound("refine", Reason.LOW_COVERAGE)
-        part = adjusted.part(*shown)
-        grown_mm = (shown[1] - shown[0] - 1) * spacing - length_mm
-        length_mm += grown_mm
-        if length_mm > 1.5 * models.needle.max_length_mm:
-            raise NeedleNotFound("refine", Reason.TOO_LONG)
-        # What grows no more may bend more than was foreseen, or go on behind a gap.
-        reach = 0 if grown_mm > min(models.refine.settled_mm, reaches[reach] / 2) else reach + 1
-        if remaining == 0 or reach == len(reaches):
-            break
-        if reach > 0 and not _anything_beyond(images, rig, part, max(reaches), models):
-            break
-        points = _extended(part.fit.points_mm, reaches[reach], spacing)
-    if length_mm < models.needle.min_length_mm / 2:
-        raise NeedleNotFound("refine", Reason.TOO_SHORT)
-    return part
-
-
-def _anything_beyond(images: Images, rig: StereoRig, part: Adjusted, reach_mm: float, models: RefineModels) -> bool:
-    """Whether anything beyond the ends of the curve, wherever it bends to, looks like a needle at all."""
-    spacing = models.refine.spacing_mm
-    even = _even(part.fit.points_mm, spacing)
-    half_width = np.full(round(reach_mm / spacing), part.appearance.half_width)
-    shown = 0
-    for outwards in (even, even[::-1]):
-        beyond = _beyond(outwards, len(half_width), spacing)
-        for image, camera, pose in zip(images, *_views(rig), strict=True):
-            sections = cut_sections(image, camera, pose.apply(beyond), models.needle)
-            evidence = axis_evidence(sections, part.appearance, half_width, WIDE)
-            most = np.where(sections.inside, evidence.log_evidence.max(axis=1), -np.inf)
-            shown = max(shown, int((most > models.refine.shown_log_odds).sum()))
-    return shown * spacing > _GOES_ON_MM
-
-
-def _shown(adjusted: Adjusted, models: RefineModels) -> tuple[int, int] | None:
-    """The longest stretch start <= i < stop of which the views show a needle, gaps bridged; None: they show none."""
-    spacing = models.refine.spacing_mm
-    shown = (adjusted.support > models.refine.shown_log_odds).mean(axis=0)
-    window = max(3, round(models.refine.shown_over_mm / spacing))
-    present = (shown > 0) & (uniform_filter1d(shown, window, mode="nearest") > models.refine.shown_share)
-    index = np.flatnonzero(present)
-    if len(index) == 0:
-        return None
-    cuts = np.flatnonzero(np.diff(index) > models.ends.max_gap_mm / spacing)
-    starts, stops = np.concatenate([[0], cuts + 1]), np.concatenate([cuts, [len(index) - 1]])
-    best = int(np.argmax([shown[index[a] : index[b] + 1].sum() for a, b in zip(starts, stops, strict=True)]))
-    return int(index[starts[best]]), int(index[stops[best]]) + 1
+@lru_cache(maxsize=4)
+def _growth(refine: RefineParameters, ends: EndsParameters, *, is_followed: bool) -> Growth:
+    reaches_mm = (refine.reach_mm,) if is_followed else (refine.reach_mm, refine.bend_reach_mm, refine.gap_reach_mm)
+    return Growth(
+        refine.spacing_mm,
+        reaches_mm,
+        PARABOLA_MM,
+        refine.settled_mm,
+        refine.max_rounds,
+        refine.shown_log_odds,
+        refine.shown_share,
+        refine.shown_over_mm,
+        ends.max_gap_mm,
+    )
 
 
 def _look_beside(

@@ -1,6 +1,8 @@
 /* A curve that is nearly right, adjusted to both silhouettes: see `tracking/adjust.py`. */
 #include "adjust.h"
 
+#define LOG_OF_TWO 0.6931472f
+
 /* Scores of looks as they are asked for. */
 typedef struct {
   const Looks *looks;
@@ -14,7 +16,7 @@ static int64_t place_of(const Looks *l, const int64_t *look) { return (look[2] *
 /* The log evidence (n,) of a look, wherever the axis is; null where its bank is wanted. */
 static const float *likely(const Scores *s, const int64_t *look) {
   const Looks *l = s->looks;
-  int64_t place = place_of(l, look), p = l->places, shifts = 2 * p - 1;
+  int64_t place = place_of(l, look), p = l->reached + 1, shifts = 2 * p - 1;
   if (s->likely[place]) return s->likely[place];
   if (!l->banks[place]) {
     l->wanted[place] = 1;
@@ -22,14 +24,20 @@ static const float *likely(const Scores *s, const int64_t *look) {
   }
   float *most = TAKE(float, s->n);
   size_t mark = taken();
-  float *both = TAKE(float, 2 * s->n * shifts), *work = TAKE(float, 8 * s->n * p);
+  float *both = TAKE(float, 2 * s->n * shifts), *work = TAKE(float, 4 * s->n * columns_of(p));
   if (!work) return 0;
-  by_background(s->shown, s->n, l->samples, l->banks[place], p, both, work);
+  by_background(s->shown, s->n, l->samples, l->banks[place], l->places, p, both, work);
   for (int64_t i = 0; i < s->n; i++) {
     const float *even = both + 2 * i * shifts + p - 1, *clutter = even + shifts;
-    float top = -INFINITY;
+    /* One background or the other is at most twice as likely as the likelier of them: few shifts have to be summed. */
+    float most_of_one = -INFINITY, top = -INFINITY;
     for (int64_t k = -l->reached; k <= l->reached; k++) {
       float more = even[k] > clutter[k] ? even[k] : clutter[k];
+      most_of_one = more > most_of_one ? more : most_of_one;
+    }
+    for (int64_t k = -l->reached; k <= l->reached; k++) {
+      float more = even[k] > clutter[k] ? even[k] : clutter[k];
+      if (more < most_of_one - LOG_OF_TWO) continue;
       float here = more + log_one_plus_exp_negative(fabsf(even[k] - clutter[k]));
       top = here > top ? here : top;
     }

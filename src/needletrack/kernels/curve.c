@@ -150,7 +150,7 @@ int weigh(const Axis *a, int64_t n, const int64_t *width, int expectation, Told 
   size_t mark = taken();
   double *log = TAKE(double, n * s), *half = TAKE(double, n), *axis = TAKE(double, n),
          *streak_work = TAKE(double, (3 * samples + 1) * n);
-  float *both = TAKE(float, 2 * n * s), *spare = TAKE(float, 8 * n * (p > a->edges + 1 ? p : a->edges + 1));
+  float *both = TAKE(float, 2 * n * s), *spare = TAKE(float, 4 * n * columns_of(p > a->edges + 1 ? p : a->edges + 1));
   int64_t *path = TAKE(int64_t, n);
   if (!path) return NO_MEMORY;
   no_needle(t->shown, n, samples, a->none_bank, a->edges, t->none, spare);
@@ -161,7 +161,7 @@ int weigh(const Axis *a, int64_t n, const int64_t *width, int expectation, Told 
       memset(t->cluttered + first, 0, (size_t)(last - first));
       continue;
     }
-    by_background(t->shown + first * f, last - first, samples, a->banks[width[first]], p, both, spare);
+    by_background(t->shown + first * f, last - first, samples, a->banks[width[first]], p, p, both, spare);
     over_none(both, t->none + first, last - first, s, log + first * s, t->cluttered + first);
   }
   prepared(log, n, s, a->refine, a->fine_shifts, a->never, (float)a->outlier, t->most, t->relative, t->likelihood);

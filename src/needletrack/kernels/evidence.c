@@ -151,34 +151,35 @@ static void multiply(const float *a, int64_t n, int64_t stride, int64_t k, const
   }
 }
 
-/* Columns of a bank, two of each of `places` shifts, as of a section and of its mirror image. */
-static int64_t padded(int64_t columns) { return (columns + 15) / 16 * 16; }
+/* Columns of a bank of p shifts: eight of them before one kind of background, the same before the other, the next. */
+int64_t columns_of(int64_t p) { return (p + 7) / 8 * 16; }
 
-/* Log evidence (n, c) of what a bank holds, and of its mirror images, for `products` (n, f) of sections of `count`.
+/* Log evidence (n, c) of what the first c columns of a bank hold, and of its mirror images, for `products` (n, f) of
+   sections of `count`.
 
-   bank: of c columns, in panels, the rows of even products and then those of odd ones. work: (2, n, c). */
-static void both_ways(const float *shown, int64_t n, int64_t count, const float *bank, int64_t c, float *ahead,
-                      float *mirrored, float *work) {
-  int64_t even = even_features(count), all = features(count);
+   bank: of `all` columns, in panels, the rows of even products and then those of odd ones. work: (2, n, c). */
+static void both_ways(const float *shown, int64_t n, int64_t count, const float *bank, int64_t all, int64_t c,
+                      float *ahead, float *mirrored, float *work) {
+  int64_t even = even_features(count), every = features(count);
   float *one = work, *other = work + n * c;
-  multiply(shown, n, all, even, bank, c, one);
-  multiply(shown + even, n, all, all - even, bank + even * padded(c), c, other);
+  multiply(shown, n, every, even, bank, c, one);
+  multiply(shown + even, n, every, every - even, bank + even * all, c, other);
   for (int64_t k = 0; k < n * c; k++) ahead[k] = one[k] + other[k], mirrored[k] = one[k] - other[k];
 }
 
 /* Log evidence (n, 2 (2 p - 1)) of the axis at each shift, first before one kind of background, then before the other.
 
-   bank: of shifts 0 .. p - 1 of either kind. work: (4, n, 2 p). */
-EXPORT void by_background(const float *shown, int64_t n, int64_t count, const float *bank, int64_t p, float *out,
-                          float *work) {
-  int64_t c = 2 * p, s = 2 * p - 1;
+   bank: of shifts 0 .. places - 1 of either kind, of which the first p are asked. work: (4, n, columns_of(p)). */
+EXPORT void by_background(const float *shown, int64_t n, int64_t count, const float *bank, int64_t places, int64_t p,
+                          float *out, float *work) {
+  int64_t c = columns_of(p), s = 2 * p - 1;
   float *ahead = work, *mirrored = ahead + n * c;
-  both_ways(shown, n, count, bank, c, ahead, mirrored, mirrored + n * c);
+  both_ways(shown, n, count, bank, columns_of(places), c, ahead, mirrored, mirrored + n * c);
   for (int64_t i = 0; i < n; i++)
     for (int64_t kind = 0; kind < 2; kind++) {
-      const float *here = ahead + i * c + kind * p, *there = mirrored + i * c + kind * p;
+      const float *here = ahead + i * c + 8 * kind, *there = mirrored + i * c + 8 * kind;
       float *row = out + 2 * i * s + kind * s + p - 1;
-      for (int64_t k = 0; k < p; k++) row[-k] = there[k], row[k] = here[k];
+      for (int64_t k = 0; k < p; k++) row[-k] = there[16 * (k / 8) + k % 8], row[k] = here[16 * (k / 8) + k % 8];
     }
 }
 
@@ -195,21 +196,21 @@ EXPORT void either_of_both(const float *both, int64_t n, int64_t s, float *out) 
 
 /* Log evidence (n,) of background alone, or of one edge between two, which may be anywhere.
 
-   bank: of background alone, before both kinds of it, and of an edge at shifts 0 .. p - 1 of either kind. work: room for
-   4 n (2 + 2 p). */
+   bank: of an edge at shifts 0 .. p - 1, and of background alone. work: (4, n, columns_of(p + 1)). */
 EXPORT void no_needle(const float *shown, int64_t n, int64_t count, const float *bank, int64_t p, double *out,
                       float *work) {
-  int64_t c = 2 + 2 * p, edges = 2 * p - 1;
+  int64_t c = columns_of(p + 1), edges = 2 * p - 1, last = 16 * (p / 8) + p % 8;
   float *ahead = work, *mirrored = ahead + n * c;
-  both_ways(shown, n, count, bank, c, ahead, mirrored, mirrored + n * c);
+  both_ways(shown, n, count, bank, c, c, ahead, mirrored, mirrored + n * c);
   for (int64_t i = 0; i < n; i++) {
     const float *one = ahead + i * c, *other = mirrored + i * c;
-    float most = one[0] > one[1] ? one[0] : one[1];
-    double alone = (double)most + log_one_plus_exp_negative(fabsf(one[0] - one[1]));
+    float most = one[last] > one[last + 8] ? one[last] : one[last + 8];
+    double alone = (double)most + log_one_plus_exp_negative(fabsf(one[last] - one[last + 8]));
     float any[2 * MOST_SAMPLES], likeliest = -INFINITY;
     for (int64_t k = 0; k < edges; k++) {
-      const float *side = k < p ? one + 2 + k : other + 2 + k - p + 1;
-      float even = side[0], clutter = side[p], more = even > clutter ? even : clutter;
+      int64_t shift = k < p ? k : k - p + 1;
+      const float *side = (k < p ? one : other) + 16 * (shift / 8) + shift % 8;
+      float even = side[0], clutter = side[8], more = even > clutter ? even : clutter;
       any[k] = more + log_one_plus_exp_negative(fabsf(even - clutter));
     }
     for (int64_t k = 0; k < edges; k++) likeliest = any[k] > likeliest ? any[k] : likeliest;

@@ -120,7 +120,9 @@ void cut_sections(const uint8_t *image, int64_t rows, int64_t columns, int64_t s
                   double *px_per_unit, uint8_t *inside);
 void products(const double *sections, int64_t n, int64_t count, const double *whitener, float *out);
 int64_t features(int64_t count);
-void by_background(const float *shown, int64_t n, int64_t count, const float *bank, int64_t p, float *out, float *work);
+int64_t columns_of(int64_t p);
+void by_background(const float *shown, int64_t n, int64_t count, const float *bank, int64_t places, int64_t p, float *out,
+                   float *work);
 void no_needle(const float *shown, int64_t n, int64_t count, const float *bank, int64_t p, double *out, float *work);
 void over_none(const float *both, const double *none, int64_t n, int64_t s, double *log, uint8_t *cluttered);
 void prepared(const double *log, int64_t n, int64_t s, const float *refine, int64_t f, double never, float outlier,

@@ -65,7 +65,8 @@ class Looks:
     """How a curve is adjusted: how far the axis may be from where each look expects it, units across, on which grid.
 
     expectation: where the first look expects it: where the curve is, on the likeliest path, or moved as a whole.
-    with_covariance: or the fit's covariance and residuals are NaN.
+    with_covariance: or the fit's covariance and residuals are NaN. looks_within: the needle's look is told from how it
+    looks within so many units of where it is; None: anywhere on the grid.
     """
 
     spreads: tuple[float, ...]
@@ -73,11 +74,12 @@ class Looks:
     expectation: Expectation
     with_streak: bool = True
     with_covariance: bool = True
+    looks_within: float | None = None
 
 
 # At a rough curve; at one that was adjusted and then lengthened; at that of the pair before; at one that is settled.
 ROUGH = Looks((0.7, 0.5, 0.4), WIDE, Expectation.PATH, with_streak=False)
-GROWING = Looks((0.7, 0.4), WIDE, Expectation.PATH, with_streak=False, with_covariance=False)
+GROWING = Looks((0.7, 0.4), WIDE, Expectation.PATH, with_streak=False, with_covariance=False, looks_within=1.75)
 MOVED, SETTLED = Looks((0.7, 0.4, 0.2), FINE, Expectation.MOVED), Looks((0.4, 0.2), NEAR, Expectation.STAYED)
 
 
@@ -327,7 +329,7 @@ def _template(needle: Needle, parameters: FitParameters, looks: Looks) -> tuple[
         _Adjust(
             axis=axis_of(needle, looks.grid, looks.spreads, kept),
             spline=spline_of(parameters, kept),
-            looks=looks_of(needle, looks.grid, wanted[0]),
+            looks=looks_of(needle, looks.looks_within or float(looks.grid.shifts[-1]), wanted[0]),
             banks=kept.at(banks(looks.grid).addresses),
             none_banks=kept.at(no_needle_addresses()),
             wanted=kept.at(wanted[1]),

@@ -99,7 +99,8 @@ def log_evidence_by_background(shown: Float32, appearance: Appearance, grid: Gri
     each = banks(grid).bank(appearance.inside, appearance.blur, appearance.half_width)
     count, places = len(shown), grid.reach + 1
     log = np.empty((count, 2 * len(grid.shifts)), np.float32)
-    call("by_background", shown, count, len(OFFSETS), each, places, log, np.empty(8 * count * places, np.float32))
+    work = np.empty(4 * count * _columns_of(places), np.float32)
+    call("by_background", shown, count, len(OFFSETS), each, places, places, log, work)
     return log
 
 
@@ -109,7 +110,7 @@ def log_evidence_of_no_needle(shown: Float32, blur: int) -> Float:
     The edge is that of something wide: of a sleeve, a rod, a vessel beside the curve. It may be anywhere.
     """
     count, log = len(shown), np.empty(len(shown))
-    work = np.empty(8 * count * (1 + EDGES), np.float32)
+    work = np.empty(4 * count * _columns_of(EDGES + 1), np.float32)
     call("no_needle", shown, count, len(OFFSETS), no_needle_bank(BLURS[blur]), EDGES, log, work)
     return log
 
@@ -195,17 +196,15 @@ def new_bank(half_width: float, blur: float, inside: int, grid: Grid) -> Float32
     for shift in range(grid.reach + 1):
         whole, rest = divmod(shift, grid.substeps)
         covariances[:, shift] = seen[rest, :, extra - whole : extra - whole + n, extra - whole : extra - whole + n]
-    return _as_bank(_weights(covariances).reshape(-1, _FEATURES))
+    return _as_bank(_weights(covariances))
 
 
 @cache
 def no_needle_bank(blur: float) -> Float32:
-    """Background alone, then a single edge at every sample from the middle on but the outermost ones."""
+    """A single edge at every sample from the middle on but the outermost ones, then background alone."""
     alone = _covariances(OFFSETS[None], 0.0, blur, 0)
     edges = _covariances(OFFSETS - np.arange(EDGES)[:, None] * ACROSS_STEP, _EDGE_HALF_WIDTH, blur, 0)
-    every = np.concatenate([alone.swapaxes(0, 1), edges.swapaxes(0, 1)], axis=1)
-    weights = _weights(every)
-    return _as_bank(np.concatenate([weights[:, 0], weights[:, 1:].reshape(-1, _FEATURES)]))
+    return _as_bank(_weights(np.concatenate([edges, alone]).swapaxes(0, 1)))
 
 
 @cache
@@ -214,14 +213,22 @@ def no_needle_addresses() -> npt.NDArray[np.uintp]:
     return np.array([address(no_needle_bank(blur)) for blur in BLURS], np.uintp)
 
 
+def _columns_of(places: int) -> int:
+    """Columns of a bank of so many places before either kind of background."""
+    return -(-places // 8) * 16
+
+
 def _as_bank(weights: Float32) -> Float32:
-    """Weights (C, F) as the kernels multiply by them: sixteen columns at a time, of even products and then of odd."""
-    columns = np.zeros((_FEATURES, -(-len(weights) // 16) * 16), np.float32)
-    columns[:, : len(weights)] = weights.T
-    panels = [
-        part.reshape(len(part), -1, 16).swapaxes(0, 1) for part in (columns[:_EVEN_FEATURES], columns[_EVEN_FEATURES:])
-    ]
-    return np.concatenate([panel.ravel() for panel in panels])
+    """Weights (kinds, places, F) as kernels multiply by them: panels of sixteen columns, of even products, then of odd.
+
+    A panel holds eight places before one kind of background and before the other, so that the places in the middle can
+    be asked alone.
+    """
+    kinds, places, _ = weights.shape
+    columns = np.zeros((_columns_of(places) // 16, _FEATURES, kinds, 8), np.float32)
+    for place in range(places):
+        columns[place // 8, :, :, place % 8] = weights[:, place].T
+    return np.concatenate([columns[:, :_EVEN_FEATURES].ravel(), columns[:, _EVEN_FEATURES:].ravel()])
 
 
 def _weights(covariances: Float) -> Float32:

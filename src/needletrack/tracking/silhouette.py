@@ -217,8 +217,8 @@ class Looks(ctypes.Structure):
     ]
 
 
-def looks_of(needle: Needle, grid: Grid, wanted: Mask) -> Looks:
-    """What a needle may look like whose axis is as far away as a grid reaches.
+def looks_of(needle: Needle, reach: float, wanted: Mask) -> Looks:
+    """What a needle may look like whose axis is at most so far away, units.
 
     The coarse grid tells looks apart as well as a fine one does, and one set of banks is less to make. wanted (insides,
     BLURS, HALF_WIDTHS): where the kernel marks the banks that it missed; the caller keeps it.
@@ -233,7 +233,7 @@ def looks_of(needle: Needle, grid: Grid, wanted: Mask) -> Looks:
         last_width=widths[-1] + 1,
         samples=len(OFFSETS),
         places=WIDE.reach + 1,
-        reached=int((np.abs(WIDE.shifts) <= grid.shifts[-1]).sum()) // 2,
+        reached=int((np.abs(WIDE.shifts) <= reach).sum()) // 2,
         blur_units=address(_BLURS),
         blur_low_px=_BLURS_PX[0],
         blur_high_px=_BLURS_PX[1],
@@ -271,7 +271,7 @@ def estimate_appearance(
     shown = products(np.concatenate(picked))
     px_per_unit = float(np.median(np.concatenate([view.px_per_unit for view in views])))
     wanted = no_bank_wanted()
-    looks = looks_of(needle, grid, wanted)
+    looks = looks_of(needle, float(grid.shifts[-1]), wanted)
     found = as_look(near)
     while call("appearance_of", looks, shown, len(shown), px_per_unit, 1 if is_white else 2, found):
         if not make_wanted(WIDE, wanted):

@@ -13,16 +13,28 @@ DEGREE = 3
 
 def arc_length(points: npt.ArrayLike) -> Float:
     """Length (N,) along a polyline (N, D) from its first point."""
-    steps = np.linalg.norm(np.diff(np.asarray(points, dtype=np.float64), axis=0), axis=1)
-    return np.concatenate([[0.0], np.cumsum(steps)])
+    array = np.ascontiguousarray(points, dtype=np.float64)
+    arc = np.empty(len(array))
+    call("arc_lengths", array, *array.shape, arc)
+    return arc
 
 
 def resample(points: npt.ArrayLike, count: int) -> Float:
     """`count` points (count, D), evenly spaced along the polyline (N, D)."""
-    array = np.asarray(points, dtype=np.float64)
-    length = arc_length(array)
-    at = np.linspace(0.0, length[-1], count)
-    return np.column_stack([np.interp(at, length, column) for column in array.T])
+    array = np.ascontiguousarray(points, dtype=np.float64)
+    return _cut(array, arc := arc_length(array), 0.0, float(arc[-1]), count)
+
+
+def cut(points: npt.ArrayLike, start: float, stop: float, count: int) -> Float:
+    """`count` points (count, D), evenly spaced from one arc length to another, of a polyline (N, D)."""
+    array = np.ascontiguousarray(points, dtype=np.float64)
+    return _cut(array, arc_length(array), start, stop, count)
+
+
+def _cut(points: Float, arc: Float, start: float, stop: float, count: int) -> Float:
+    out = np.empty((count, points.shape[1]))
+    call("cut_evenly", points, arc, *points.shape, start, stop, count, out)
+    return out
 
 
 def unit(vectors: npt.ArrayLike) -> Float:
@@ -33,11 +45,10 @@ def unit(vectors: npt.ArrayLike) -> Float:
 
 def distance_from_curve(points: npt.ArrayLike, curve: npt.ArrayLike) -> Float:
     """Distance (N,) of each point (N, D) from a polyline (M, D)."""
-    at, line = np.asarray(points, dtype=np.float64), np.asarray(curve, dtype=np.float64)
-    start, step = line[:-1], np.diff(line, axis=0)
-    along = ((at[:, None] - start) * step).sum(-1) / np.maximum((step**2).sum(-1), 1e-12)
-    nearest = start + np.clip(along, 0, 1)[..., None] * step
-    return np.asarray(np.linalg.norm(at[:, None] - nearest, axis=-1).min(axis=1))
+    at, line = (np.ascontiguousarray(each, dtype=np.float64) for each in (points, curve))
+    distance = np.empty(len(at))
+    call("distances_from", at, len(at), line, *line.shape, distance)
+    return distance
 
 
 def tangents(points: npt.ArrayLike) -> Float:

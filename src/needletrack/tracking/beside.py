@@ -5,15 +5,15 @@ The image is straightened along the projected curve. The needle's own axis is `s
 
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
 from needletrack.geometry.camera import Camera
-from needletrack.geometry.spline import tangents
+from needletrack.kernels import call
 from needletrack.records import Float, Image
 from needletrack.tracking.needle import Positive
-from needletrack.tracking.profile import EDGE_SPREAD_PX, FLANK_PX, find_line, flanks
+from needletrack.tracking.profile import EDGE_SPREAD_PX, FLANK_PX, Float32, find_line, flanks
+from needletrack.tracking.silhouette import rows_of
 
 _ACROSS_STEP_PX = 0.5
 # A line beyond the needle's end is looked for within so much of the curve, and its flanks so far from its edges.
@@ -53,19 +53,11 @@ def look_beside(
     image: Image, camera: Camera, points_mm: Float, diameter_mm: float, parameters: BesideParameters
 ) -> Beside:
     """The view about a curve (N, 3), given in this camera's frame and evenly spaced, of a needle of that diameter."""
-    center = camera.project(points_mm)
-    along = tangents(center)
-    normal = np.column_stack([-along[:, 1], along[:, 0]])
     width_px = diameter_mm * camera.focal_px / points_mm[:, 2]
     middle_px = float(np.median(width_px))
-    reach_px = middle_px / 2 + parameters.search_px + EDGE_SPREAD_PX + FLANK_PX
-    steps = np.ceil(reach_px / _ACROSS_STEP_PX) + 1
-    offsets = np.arange(-steps, steps + 1) * _ACROSS_STEP_PX
-    x, y = ((center[:, None, k] + offsets * normal[:, None, k]).astype(np.float32) for k in (0, 1))
-    strip = np.asarray(cv2.remap(image, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE), dtype=np.float64)
+    offsets = _offsets_px(middle_px / 2 + parameters.search_px + EDGE_SPREAD_PX + FLANK_PX + _ACROSS_STEP_PX)
     sigma_rows = parameters.smooth_along_mm / float(np.linalg.norm(points_mm[1] - points_mm[0]))
-    smooth = cv2.GaussianBlur(strip, (1, 0), sigmaX=1e-6, sigmaY=sigma_rows, borderType=cv2.BORDER_REPLICATE)
-    strip = np.asarray(smooth, dtype=np.float64)
+    strip = _strip(image, camera, points_mm, offsets, sigma_rows)
     line = find_line(strip, offsets, middle_px, parameters.search_px, parameters.line_height_gray)
     fits = line.found & (line.width_px < parameters.max_width_share * width_px + 0.5)
     return Beside(flanks(strip, offsets, middle_px), np.where(fits, line.height_gray * line.width_px, 0.0))
@@ -77,14 +69,9 @@ def line_height_gray(image: Image, camera: Camera, points_mm: Float, diameter_mm
     The curve is given in this camera's frame. Negative where it is darker; 0 where one side is brighter and one darker,
     as at an edge. The curve's mean profile counts, so that a line that is fainter than the noise is seen.
     """
-    center = camera.project(points_mm)
-    along = tangents(center)
-    normal = np.column_stack([-along[:, 1], along[:, 0]])
     half_px = diameter_mm * camera.focal_px / float(np.median(points_mm[:, 2])) / 2
-    steps = np.ceil((half_px + _FLANK_TO_PX + _LINE_OFF_PX) / _ACROSS_STEP_PX)
-    offsets = np.arange(-steps, steps + 1) * _ACROSS_STEP_PX
-    x, y = ((center[:, None, k] + offsets * normal[:, None, k]).astype(np.float32) for k in (0, 1))
-    profile = cv2.remap(image.astype(np.float32), x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE).mean(axis=0)
+    offsets = _offsets_px(half_px + _FLANK_TO_PX + _LINE_OFF_PX)
+    profile = _strip(image, camera, points_mm, offsets, 0.0).mean(axis=0, dtype=np.float64)
     most = 0.0
     for off in np.arange(-_LINE_OFF_PX, _LINE_OFF_PX + 1e-6, _ACROSS_STEP_PX):
         at = offsets - off
@@ -94,3 +81,28 @@ def line_height_gray(image: Image, camera: Camera, points_mm: Float, diameter_mm
         height = float(np.sign(over[0]) * np.abs(over).min()) if over[0] * over[1] > 0 else 0.0
         most = height if abs(height) > abs(most) else most
     return most
+
+
+def _offsets_px(reach_px: float) -> Float:
+    steps = np.ceil(reach_px / _ACROSS_STEP_PX)
+    return np.arange(-steps, steps + 1) * _ACROSS_STEP_PX
+
+
+def _strip(image: Image, camera: Camera, points_mm: Float, offsets_px: Float, sigma_rows: float) -> Float32:
+    """Grey levels (N, len(offsets_px)) across a curve, smoothed along it."""
+    strip = np.empty((len(points_mm), len(offsets_px)), np.float32)
+    failed = call(
+        "strip_beside",
+        *rows_of(image),
+        camera.lens,
+        np.ascontiguousarray(points_mm),
+        len(points_mm),
+        float(offsets_px[0]),
+        _ACROSS_STEP_PX,
+        len(offsets_px),
+        sigma_rows,
+        strip,
+    )
+    if failed:
+        raise MemoryError("there is no memory for the kernel that looks beside a curve")
+    return strip

@@ -6,13 +6,14 @@ All functions take a strip (N, M) of grey levels, one cross section a row, and t
 import math
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 import numpy.typing as npt
 
+from needletrack.kernels import call
 from needletrack.records import Float
 
 Mask = npt.NDArray[np.bool_]
+Float32 = npt.NDArray[np.float32]
 
 # Lens blur and interpolation spread an edge over about this much to either side.
 EDGE_SPREAD_PX = 1.5
@@ -40,7 +41,7 @@ def noise_gray(strip: Float) -> float:
     return max(0.3, float(quiet.mean()) / 0.5586 / math.sqrt(6))
 
 
-def flanks(strip: Float, offsets: Float, width_px: float) -> Float:
+def flanks(strip: Float | Float32, offsets: Float, width_px: float) -> Float:
     """Mean grey level (2, N) of a band close beside a needle of the given width, on its low and its high side."""
     inner = width_px / 2 + EDGE_SPREAD_PX + 0.5
     return np.stack([strip[:, band].mean(axis=1) for band in _bands(offsets, inner)])
@@ -52,42 +53,31 @@ def _bands(offsets: Float, inner_px: float) -> list[slice]:
     return [low, high]
 
 
-def find_line(strip: Float, offsets: Float, width_px: float, search_px: float, min_height_gray: float) -> Line:
+def find_line(
+    strip: Float | Float32, offsets: Float, width_px: float, search_px: float, min_height_gray: float
+) -> Line:
     """The bright or dark line that stands out most from both its sides, whatever lies further out.
 
     Its height is that over the nearer to it of the extremes on its two sides (a top-hat), its edges are at half height.
+    offsets: evenly spaced.
     """
-    n = len(strip)
+    count, columns = strip.shape
     step_px = float(offsets[1] - offsets[0])
     reach = max(2, round((width_px / 2 + 2 * EDGE_SPREAD_PX) / step_px))
-    # Bright lines are looked for in the strip, dark ones in its negative.
-    both = np.concatenate([strip, -strip]).astype(np.float32)
-    kernel = np.ones((1, reach + 1), np.uint8)
-    bases = [
-        cv2.erode(both, kernel, anchor=(anchor, 0), borderType=cv2.BORDER_REPLICATE).astype(np.float64)
-        for anchor in (reach, 0)
-    ]
-    signed = both.astype(np.float64)
-    height = np.where(np.abs(offsets) <= search_px + 1.0, signed - np.maximum(*bases), 0.0)
-    best = height.argmax(axis=1)
-    rows = np.arange(2 * n)
-    heights = height[rows, best]
-    chosen = np.where(heights[:n] >= heights[n:], np.arange(n), np.arange(n, 2 * n))
-    signed, top, bases = signed[chosen], best[chosen], [base[chosen] for base in bases]
-    low_px = _half_height(signed[:, ::-1], -offsets[::-1], len(offsets) - 1 - top, bases[0][:, ::-1])
-    high_px = _half_height(signed, offsets, top, bases[1])
-    middle, width = (high_px - low_px) / 2, high_px + low_px
-    found = (heights[chosen] > min_height_gray) & (width > 0.5) & (np.abs(middle) <= search_px)
-    return Line(found, middle, width, heights[chosen])
-
-
-def _half_height(signed: Float, offsets: Float, top: npt.NDArray[np.int64], base: Float) -> Float:
-    """Offset (N,) at which each row, followed upwards from `top`, has fallen half way to its base there."""
-    rows, columns = np.arange(len(signed)), np.arange(signed.shape[1])
-    level = (signed[rows, top] + base[rows, top]) / 2
-    below = (signed < level[:, None]) & (columns > top[:, None])
-    out = np.maximum(below.argmax(axis=1), 1)
-    step = signed[rows, out - 1] - signed[rows, out]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        fraction = np.where(step > 0, (signed[rows, out - 1] - level) / step, 0.5)
-    return np.asarray(offsets[out - 1] + (offsets[out] - offsets[out - 1]) * np.clip(fraction, 0, 1))
+    found, (middle, width, height) = np.empty(count, np.bool_), np.empty((3, count))
+    call(
+        "find_lines",
+        np.ascontiguousarray(strip, dtype=np.float32),
+        count,
+        columns,
+        float(offsets[0]),
+        step_px,
+        reach,
+        search_px,
+        min_height_gray,
+        found,
+        middle,
+        width,
+        height,
+    )
+    return Line(found, middle, width, height)

@@ -12,7 +12,7 @@ from scipy.ndimage import uniform_filter1d
 
 from needletrack.errors import NeedleNotFound
 from needletrack.geometry.camera import Camera
-from needletrack.geometry.spline import arc_length, resample, spline_basis, unit
+from needletrack.geometry.spline import arc_length, cut, resample, spline_basis, unit
 from needletrack.geometry.stereo import StereoRig
 from needletrack.geometry.transform import RigidTransform
 from needletrack.records import Appearance, Float, NeedleTrack, Reason
@@ -139,6 +139,20 @@ class Refined:
         return np.asarray((covariance + covariance.T) / 2)
 
 
+@dataclass(frozen=True, slots=True)
+class Traced:
+    """A curve (N, 3) that was followed to its ends, base first where that is known, and what the needle looks like.
+
+    moved, steady: what it was followed from, where that was the track of the pair before.
+    """
+
+    points_mm: Float
+    appearance: Appearance
+    base_is_known: bool
+    moved: Adjusted | None
+    steady: Steady | None
+
+
 def refine(
     images: Images,
     rig: StereoRig,
@@ -153,6 +167,19 @@ def refine(
     previous: the track of the pair before, whose curve this is, which is then nearly right and tells base from tip
     where no sleeve is seen; without it the curve is a rough one. since_s: how long ago it was taken; 0: nobody knows.
     """
+    return settled(images, rig, trace(images, rig, points_mm, models, previous=previous, since_s=since_s), models)
+
+
+def trace(
+    images: Images,
+    rig: StereoRig,
+    points_mm: Float,
+    models: RefineModels,
+    *,
+    previous: NeedleTrack | None = None,
+    since_s: float = 0.0,
+) -> Traced:
+    """The first half of `refine`: the curve to both its ends, and which of them is the base."""
     steady = None if previous is None or set(previous.reasons) - _STEADY_DESPITE else _steady(previous, since_s, models)
     spacing = models.refine.spacing_mm
     moved = None if steady is None else _moved(images, rig, steady, models)
@@ -184,23 +211,28 @@ def refine(
     base_is_known = base is not None and not (
         stretch.sleeve is not None and _goes_on(images, rig, extended, observed, stretch, seen_diameter_mm, models)
     )
-    if moved is not None:
-        ended = _ended(images, rig, extended[stretch.start : stretch.stop], moved, models, steady)
+    return Traced(extended[stretch.start : stretch.stop], appearance, base_is_known, moved, steady)
+
+
+def settled(images: Images, rig: StereoRig, traced: Traced, models: RefineModels) -> Refined:
+    """The second half of `refine`: the curve as well as both views show it, to its tip."""
+    if traced.moved is not None:
+        ended = _ended(images, rig, traced.points_mm, traced.moved, models, traced.steady)
     else:
         adjusted = adjust(
             images,
             rig,
-            _even(extended[stretch.start : stretch.stop], spacing),
+            _even(traced.points_mm, models.refine.spacing_mm),
             models.needle,
             models.fit,
-            appearance,
+            traced.appearance,
             looks=SETTLED,
         )
         ended = _ended(images, rig, adjusted.fit.points_mm, adjusted, models)
         if abs(ended.tip.at_mm - float(arc_length(adjusted.fit.points_mm)[-1])) > _TIP_MOVED_MM:
             # Beyond its tip the curve was a guess, and so was what lay about it.
             ended = _ended(images, rig, ended.final.fit.points_mm, ended.final, models)
-    return _with_tip(images, rig, ended, models, base_is_known=base_is_known)
+    return _with_tip(images, rig, ended, models, base_is_known=traced.base_is_known)
 
 
 @dataclass(frozen=True, slots=True)
@@ -491,6 +523,4 @@ def _beyond(points_mm: Float, count: int, spacing_mm: float) -> Float:
 
 
 def _cut(points_mm: Float, start_mm: float, stop_mm: float, spacing_mm: float) -> Float:
-    arc = arc_length(points_mm)
-    at = np.linspace(start_mm, stop_mm, max(8, round((stop_mm - start_mm) / spacing_mm) + 1))
-    return np.column_stack([np.interp(at, arc, column) for column in points_mm.T])
+    return cut(points_mm, start_mm, stop_mm, max(8, round((stop_mm - start_mm) / spacing_mm) + 1))

@@ -18,7 +18,7 @@ from needletrack.tracking.detect import detect
 from needletrack.tracking.fit import initial_curve
 from needletrack.tracking.match import Candidate
 from needletrack.tracking.parameters import TrackingParameters
-from needletrack.tracking.refine import RefineModels, glanced, is_line_beyond, refine
+from needletrack.tracking.refine import RefineModels, Traced, glanced, is_line_beyond, refine, settled, trace
 from needletrack.tracking.shape import Shape, as_track, differ, judged
 from needletrack.tracking.silhouette import make_banks, unit_mm
 from needletrack.tracking.stopwatch import Stopwatch
@@ -238,9 +238,18 @@ def _best(
     """The best of the shapes that are known and that candidates lead to; raises NeedleNotFound where there is none."""
     found = [*known]
     lost: list[NeedleNotFound] = []
+    baseless: list[tuple[Traced, Candidate]] = []
+
+    def settle(traced: Traced, candidate: Candidate) -> None:
+        refined = settled(images, rig, traced, _models(parameters))
+        found.append((judged(refined, rig, parameters, previous), candidate))
+
+    def any_holds() -> bool:
+        return any(not shape.reasons for shape, _ in found)
+
     for candidate in candidates:
         # What is much worse matched is examined only for want of a shape that holds.
-        if candidate.score < _RIVAL_SHARE * candidates[0].score and any(not shape.reasons for shape, _ in found):
+        if candidate.score < _RIVAL_SHARE * candidates[0].score and any_holds():
             continue
         # What lies along a shape that holds leads to it once more.
         if any(
@@ -253,8 +262,18 @@ def _best(
                 rough_mm = initial_curve(
                     candidate.points_mm, candidate.confidence, parameters.refine.spacing_mm, parameters.fit
                 )
-                refined = refine(images, rig, rough_mm, _models(parameters))
-                found.append((judged(refined, rig, parameters, previous), candidate))
+                traced = trace(images, rig, rough_mm, _models(parameters))
+                if traced.base_is_known:
+                    settle(traced, candidate)
+                else:
+                    baseless.append((traced, candidate))
+        except NeedleNotFound as error:
+            lost.append(error)
+    # What has no base does not hold: it matters only where nothing does.
+    for traced, candidate in () if any_holds() else baseless:
+        try:
+            with stopwatch("refine"):
+                settle(traced, candidate)
         except NeedleNotFound as error:
             lost.append(error)
     if not found:

@@ -149,7 +149,7 @@ static int tip_of(const Glance *g, const Eye *eyes, TipView *views, const double
   int64_t most = (int64_t)((g->tip_before_mm + g->tip_beyond_mm) / g->row_mm) + 2, plane = most * g->width;
   double *rows_mm = TAKE(double, most), *rows = TAKE(double, 3 * most), *local = TAKE(double, 3 * most),
          *gray = TAKE(double, plane), *work = TAKE(double, 4 * plane + 16 * most),
-         *tip_work = TAKE(double, (most + 1) * 19 * 16 + most + 2 * 23 * 23), *planes[2], *fixed[2], *weight[2], rules[12];
+         *tip_work = TAKE(double, 2 * ((most + 1) * 19 * 16 + most) + 2 * 23 * 23), *planes[2], *fixed[2], *weight[2], rules[12];
   for (int v = 0; v < 2; v++)
     planes[v] = TAKE(double, 8 * plane), fixed[v] = TAKE(double, 64), weight[v] = TAKE(double, plane);
   if (!weight[1]) return NO_MEMORY;

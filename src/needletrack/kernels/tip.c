@@ -106,43 +106,78 @@ EXPORT void pictures_of(const double *pictures, int64_t distances, int64_t parts
   }
 }
 
-/* For apexes at_mm (apexes,): squared greys left over, and the log determinant of what the parts could show.
+/* One view of an end, in which apexes of one shape are tried, and what they have in common.
 
    The pictures show each part of the inside at distances before_mm + picture_mm * (0 ... s - 1) before the apex; before
-   and beyond all is as in the outermost. weight (n, width); weighted (n, width, 8): planes and grey, weighted; fixed
-   (8, 8): their products; prior (7 + parts,)^2; arc_mm (n,) of the rows, ascending. work: room for
-   (n + 1) * parts * (8 + parts) + n. Returns 1 where it fails. */
-static int misfits(const double *at_mm, int64_t apexes, const double *arc_mm, int64_t n, int64_t width,
-                   const Shape *shape, int64_t parts, int64_t s, double before_mm, double picture_mm,
-                   const double *weight, const double *weighted, const double *fixed, const double *prior, double *work,
-                   double *out) {
-  int64_t each = parts * (PLANES + 1 + parts), size = PLANES + parts;
-  uint8_t *whole = (uint8_t *)(work + (n + 1) * each);
-  for (int64_t r = 0; r < n; r++) {
-    whole[r] = 1;
-    for (int64_t k = 0; k < width; k++) whole[r] &= weight[r * width + k] == 1;
+   and beyond all is as in the outermost. sums (n + 1, each): over the rows from `first` on of what shows the shaft, which
+   far from the apex all rows do, as many of them as were asked for so far. */
+typedef struct {
+  const TipView *view;
+  const double *arc_mm;
+  int64_t n, width, each, first, summed;
+  double picture_mm;
+  Shape shape;
+  int64_t s;
+  double before_mm;
+  double *sums;
+  uint8_t *whole;
+} Tried;
+
+static int64_t row_of(const Tried *t, double at_mm, int64_t r) {
+  return (int64_t)rint((at_mm - t->arc_mm[r] - t->before_mm) / t->picture_mm);
+}
+
+/* Another shape is tried, whose apexes are not before lowest_mm. */
+static void try_shape(Tried *t, int64_t shape, double lowest_mm) {
+  t->shape = (Shape){t->view->pictures[shape], t->view->own[shape], t->view->extent[shape]};
+  t->s = t->view->distances[shape], t->before_mm = t->view->before_mm[shape];
+  memset(t->sums, 0, (size_t)t->each * sizeof *t->sums);
+  t->first = 0;
+  double *into = t->sums;
+  while (t->first < t->n && row_of(t, lowest_mm, t->first) >= t->s - 1) {
+    int64_t r = t->first++;
+    add_row(&t->shape, t->s - 1, t->view->parts, t->view->weighted + r * t->width * KINDS,
+            t->view->weight + r * t->width, t->whole[r], t->width, into, into + t->view->parts * KINDS);
   }
-  /* Far from the apex all rows are alike: sums over the first r rows, all of them of the shaft. */
-  memset(work, 0, (size_t)each * sizeof *work);
-  double farthest = -INFINITY;
-  for (int64_t a = 0; a < apexes; a++) farthest = at_mm[a] > farthest ? at_mm[a] : farthest;
-  for (int64_t r = 0; r < n; r++) {
-    double *sums = work + (r + 1) * each;
-    if ((int64_t)rint((farthest - arc_mm[r] - before_mm) / picture_mm) < s - 1) break;
-    memcpy(sums, work + r * each, (size_t)each * sizeof *work);
-    add_row(shape, s - 1, parts, weighted + r * width * KINDS, weight + r * width, whole[r], width, sums,
-            sums + parts * KINDS);
+  t->summed = t->first;
+}
+
+/* The sums over all rows of the shaft for an apex, and how many they are. */
+static const double *shaft_of(Tried *t, double at_mm, int64_t *rows, double *none) {
+  int64_t r = 0;
+  while (r < t->n && row_of(t, at_mm, r) >= t->s - 1) r++;
+  *rows = r;
+  if (r < t->first) {
+    /* Before all that were foreseen: of no needle at all. */
+    *rows = 0;
+    memset(none, 0, (size_t)t->each * sizeof *none);
+    return none;
   }
+  for (; t->summed < r; t->summed++) {
+    double *sums = t->sums + (t->summed + 1 - t->first) * t->each;
+    memcpy(sums, sums - t->each, (size_t)t->each * sizeof *sums);
+    add_row(&t->shape, t->s - 1, t->view->parts, t->view->weighted + t->summed * t->width * KINDS,
+            t->view->weight + t->summed * t->width, t->whole[t->summed], t->width, sums, sums + t->view->parts * KINDS);
+  }
+  return t->sums + (r - t->first) * t->each;
+}
+
+/* For apexes at_mm (apexes,): squared greys left over, and the log determinant of what the parts could show.
+
+   prior: (7 + parts,)^2. Returns 1 where it fails. */
+static int misfits(Tried *t, const double *at_mm, int64_t apexes, const double *prior, double *out) {
+  int64_t parts = t->view->parts, size = PLANES + parts, n = t->n, each = t->each;
+  const double *fixed = t->view->fixed;
   for (int64_t a = 0; a < apexes; a++) {
     double sums[MOST * (PLANES + 1 + MOST)], normal[(PLANES + MOST) * (PLANES + MOST)], target[PLANES + MOST];
-    int64_t r = 0;
-    while (r < n && (int64_t)rint((at_mm[a] - arc_mm[r] - before_mm) / picture_mm) >= s - 1) r++;
-    memcpy(sums, work + r * each, (size_t)each * sizeof *sums);
+    int64_t r;
+    const double *shaft = shaft_of(t, at_mm[a], &r, sums);
+    if (shaft != sums) memcpy(sums, shaft, (size_t)each * sizeof *sums);
     for (; r < n; r++) {
-      int64_t row = (int64_t)rint((at_mm[a] - arc_mm[r] - before_mm) / picture_mm);
+      int64_t row = row_of(t, at_mm[a], r);
       if (row < 0) break; /* Nothing of it shows from here on. */
-      add_row(shape, row, parts, weighted + r * width * KINDS, weight + r * width, whole[r], width, sums,
-              sums + parts * KINDS);
+      add_row(&t->shape, row < t->s ? row : t->s - 1, parts, t->view->weighted + r * t->width * KINDS,
+              t->view->weight + r * t->width, t->whole[r], t->width, sums, sums + parts * KINDS);
     }
     const double *own = sums + parts * (PLANES + 1);
     for (int64_t i = 0; i < size; i++) {
@@ -322,7 +357,7 @@ static void together(const double *at, const double *cost, int64_t t, double sig
    samples share, sigma between the views, least noise, where the end was expected from end_mm and its sigma, least
    sigma, log evidence that makes a rival). prior, log_prior: of the background's and inside's parts, grey^-2.
    out = (at_mm, each_mm (2,), sigma_mm (2,), contrast (2,), the shape's number). work: room for
-   (n + 1) * 19 * 16 + n + 2 * (7 + 16)^2. Returns 1 where the picture shows nothing. */
+   2 ((n + 1) * 19 * 16 + n) + 2 * (7 + 16)^2. Returns 1 where the picture shows nothing. */
 EXPORT int find_tip(const TipView *views, int64_t shapes, const double *arc_mm, int64_t n, int64_t width,
                     double picture_mm, const double *prior, double log_prior, double end_mm, const double *rules,
                     double *out, double *work) {
@@ -334,10 +369,7 @@ EXPORT int find_tip(const TipView *views, int64_t shapes, const double *arc_mm, 
   if (tries > MOST_PLACES || fine > MOST_PLACES || shapes > MOST_SHAPES) return 1;
   for (int64_t k = 0; k < tries; k++) coarse[k] = end_mm + rules[0] + rules[2] * (double)k;
   double *scaled[2], log_priors[2];
-  Shape shapes_of[2][MOST_SHAPES];
-  for (int v = 0; v < 2; v++)
-    for (int64_t k = 0; k < shapes; k++)
-      shapes_of[v][k] = (Shape){views[v].pictures[k], views[v].own[k], views[v].extent[k]};
+  Tried tried[2];
   for (int v = 0; v < 2; v++) {
     int64_t size = PLANES + views[v].parts;
     double unit = views[v].noise_gray * views[v].noise_gray * rules[5];
@@ -348,18 +380,26 @@ EXPORT int find_tip(const TipView *views, int64_t shapes, const double *arc_mm, 
     samples[v] = samples[v] > 1 ? samples[v] : 1;
   }
   work += 2 * (PLANES + views[0].parts) * (PLANES + views[0].parts);
+  for (int v = 0; v < 2; v++) {
+    Tried *t = tried + v;
+    int64_t each = views[v].parts * (KINDS + views[v].parts);
+    *t = (Tried){.view = views + v, .arc_mm = arc_mm, .n = n, .width = width, .each = each, .picture_mm = picture_mm};
+    t->sums = work, work += (n + 1) * each;
+    t->whole = (uint8_t *)work, work += n / 8 + 1;
+    for (int64_t r = 0; r < n; r++) {
+      t->whole[r] = 1;
+      for (int64_t k = 0; k < width; k++) t->whole[r] &= views[v].weight[r * width + k] == 1;
+    }
+  }
   double foreseen = end_mm + rules[8];
   for (int64_t shape = 0; shape < shapes; shape++) {
+    for (int v = 0; v < 2; v++) try_shape(tried + v, shape, coarse[0] - rules[4]);
     for (int pass = 0; pass < 2; pass++) {
       int64_t count = pass ? fine : tries;
       const double *at = pass ? near[shape] : coarse;
       for (int v = 0; v < 2; v++) {
-        const TipView *view = views + v;
         double *into = pass ? found[shape][v] : rough[v];
-        if (misfits(at, count, arc_mm, n, width, &shapes_of[v][shape], view->parts, view->distances[shape],
-                    view->before_mm[shape], picture_mm, view->weight, view->weighted, view->fixed, scaled[v], work,
-                    into))
-          return 1;
+        if (misfits(tried + v, at, count, scaled[v], into)) return 1;
         for (int64_t k = 0; k < count; k++) into[2 * k + 1] -= log_priors[v];
         double least = INFINITY;
         for (int64_t k = 0; k < count; k++) least = into[2 * k] < least ? into[2 * k] : least;
@@ -407,16 +447,13 @@ EXPORT int find_tip(const TipView *views, int64_t shapes, const double *arc_mm, 
   }
   out[0] = lowest(near[chosen], both[chosen], fine);
   for (int v = 0; v < 2; v++) {
-    const TipView *view = views + v;
     out[1 + v] = lowest(near[chosen], cost[chosen] + v * fine, fine);
     double sigma = width_of(near[chosen], cost[chosen] + v * fine, fine);
     out[3 + v] = sigma > rules[10] ? sigma : rules[10];
     /* Of a needle that goes on, and of none. */
     double ends[2] = {arc_mm[n - 1] + 4, arc_mm[0] - 2}, others[4], best = INFINITY;
-    if (misfits(ends, 2, arc_mm, n, width, &shapes_of[v][chosen], view->parts, view->distances[chosen],
-                view->before_mm[chosen], picture_mm, view->weight, view->weighted, view->fixed, scaled[v], work,
-                others))
-      return 1;
+    if (shapes > 1) try_shape(tried + v, chosen, coarse[0] - rules[4]);
+    if (misfits(tried + v, ends, 2, scaled[v], others)) return 1;
     for (int64_t k = 0; k < fine; k++) best = found[chosen][v][2 * k] < best ? found[chosen][v][2 * k] : best;
     double better = ((others[0] < others[2] ? others[0] : others[2]) - best) / scale[v] / rules[5];
     out[5 + v] = sqrt(better > 0 ? better : 0);

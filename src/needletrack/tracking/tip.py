@@ -152,7 +152,7 @@ def find_tip(
         end_mm,
         rules(tried_mm, foreseen_mm, end_mm, parameters),
         found,
-        np.empty((len(arc_mm) + 1) * 19 * 16 + len(arc_mm) + 2 * 23 * 23),
+        np.empty(2 * ((len(arc_mm) + 1) * 19 * 16 + len(arc_mm)) + 2 * 23 * 23),
     )
     del kept
     if failed:

@@ -1,7 +1,7 @@
 """Tracks of the bundled recordings against their exact truth."""
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 from threading import Event
@@ -11,9 +11,10 @@ import pytest
 
 from needletrack.recording.asl import AslRecording
 from needletrack.recording.replay import ReplaySource
-from needletrack.records import NeedleTrack, Status
+from needletrack.records import Evidence, NeedleCurve, NeedleTrack, Status, StereoPair
 from needletrack.scoring import Score, Summary, recorded_truth, score
-from needletrack.tracking.track import track_pair
+from needletrack.tracking.parameters import TrackingParameters
+from needletrack.tracking.track import audit, track_pair
 
 RECORDINGS = Path(__file__).parent / "data" / "recordings"
 STILLS = ("lab-a", "absent-a", "steel-a", "tissue-a", "hard-a")
@@ -135,6 +136,53 @@ def test_every_pair_has_its_track_and_no_ok_one_misleads(name: str) -> None:
 def test_a_sequence_has_its_tracks_and_no_ok_one_misleads() -> None:
     assert {track.captured_at_ns for track, _ in tracked("steer-b", independent=False)} == stamps("steer-b")
     assert [one for one in scores("steer-b", independent=False) if one.false_ok] == []
+
+
+def test_a_needle_that_is_pushed_and_drawn_back_again_and_again_misleads_no_one() -> None:
+    # Drawn back, with a glint behind its tip, it was called ok 1.8 to 2.4 mm short in 3 of 48 tracks. Now 53 of 61 are
+    # ok, and the worst is 0.54 mm off.
+    recording = AslRecording(RECORDINGS / "steer-b")
+    truth = recorded_truth(RECORDINGS / "steer-b")
+    pairs = list(ReplaySource(recording).pairs(Event()))
+    assert len(pairs) == 16
+    forward, backward = list(range(16)), list(range(14, -1, -1))
+    found: list[tuple[NeedleTrack, Score]] = []
+    previous = None
+    for number, index in enumerate([*forward, *backward, *forward[1:], *backward]):
+        pair, stamp_ns = pairs[index], number * 33_333_333
+        left, right = (replace(frame, captured_at_ns=stamp_ns) for frame in (pair.left, pair.right))
+        previous = track_pair(StereoPair(left, right, number), recording.rig, None, previous)
+        found.append((previous, score(previous, truth[pair.captured_at_ns])))
+    tips_mm = [one.tip_mm for track, one in found if track.status is Status.OK and one.tip_mm is not None]
+    assert [one for _, one in found if one.false_ok] == []
+    assert len(tips_mm) > 40
+    assert max(tips_mm) < 0.8
+    assert np.median(tips_mm) < 0.23
+
+
+@pytest.mark.parametrize("cut_mm", [4, 9])
+@pytest.mark.parametrize("name", ["steer-b", "hard-a"])
+def test_an_audit_confirms_no_needle_that_was_followed_to_less_than_its_tip(name: str, cut_mm: int) -> None:
+    # Within its reach it found what looks like a tip, held by where the tip was believed to be: 9 of 340 were called ok
+    # 1.1 to 2.4 mm short.
+    recording = AslRecording(RECORDINGS / name)
+    truth = recorded_truth(RECORDINGS / name)
+    for pair, (track, _) in list(zip(ReplaySource(recording).pairs(Event()), tracked(name), strict=True))[::3]:
+        if track.curve is None:
+            continue
+        curve = track.curve
+        shown = slice(len(curve.points_mm) - cut_mm)
+        short = NeedleCurve(
+            curve.points_mm[shown],
+            curve.sigma_mm[shown],
+            curve.seen[shown],
+            curve.curvature_per_mm[shown],
+            curve.length_mm - cut_mm,
+        )
+        tip = None if track.tip is None else replace(track.tip, position_mm=short.points_mm[-1])
+        followed = replace(track, curve=short, tip=tip, evidence=Evidence())
+        audited = audit(pair, recording.rig, TrackingParameters(), followed)
+        assert not score(audited, truth[pair.captured_at_ns]).false_ok, pair.captured_at_ns
 
 
 @pytest.mark.slow

@@ -106,7 +106,7 @@ REASON_MEANING: Mapping[Reason, str] = MappingProxyType(
         Reason.TOO_SHORT: "The shape is shorter than the shortest needle that can be told from clutter.",
         Reason.TOO_LONG: "The shape is longer than the configured greatest length.",
         Reason.WIDTH_OUT_OF_RANGE: "The width seen in the images does not fit the configured diameter range.",
-        Reason.AMBIGUOUS_SHAPE: "A second, different shape explains the images almost as well.",
+        Reason.AMBIGUOUS_SHAPE: "Another shape explains the images almost as well, or nothing has confirmed this one.",
         Reason.AMBIGUOUS_BASE: "Which end is the base cannot be told; base and tip may be exchanged.",
         Reason.LOW_COVERAGE: "Too small a share of the shape is seen by both cameras.",
         Reason.ALONG_EPIPOLAR_LINES: "A long stretch runs along the epipolar lines, where two views fix no depth.",

@@ -25,7 +25,7 @@ typedef struct {
   int64_t width;
   double picture_mm, reach;
   const double *picture_rules, *tip_rules, *prior;
-  double log_prior, foreseen_sigma_mm;
+  double log_prior, beyond_end_mm, foreseen_off_mm, foreseen_sigma_mm;
   int64_t tip_rounds;
   /* What is beside it. */
   double diameter_mm, line_search_px, edge_spread_px, flank_px, smooth_mm, beside_before_mm, beside_beyond_mm,
@@ -153,7 +153,7 @@ static int tip_of(const Glance *g, const Eye *eyes, TipView *views, const double
   for (int v = 0; v < 2; v++)
     planes[v] = TAKE(double, 8 * plane), fixed[v] = TAKE(double, 64), weight[v] = TAKE(double, plane);
   if (!weight[1]) return NO_MEMORY;
-  double foreseen = end_mm;
+  double foreseen = end_mm + g->foreseen_off_mm;
   for (int64_t remaining = g->tip_rounds;;) {
     double first = end_mm - g->tip_before_mm, last = end_mm + g->tip_beyond_mm;
     first = first > 0 ? first : 0, last = last < arc[n - 1] ? last : arc[n - 1];
@@ -175,10 +175,10 @@ static int tip_of(const Glance *g, const Eye *eyes, TipView *views, const double
     if (find_tip(views, 1, rows_mm, count, g->width, g->picture_mm, g->prior, g->log_prior, end_mm, rules, found,
                  tip_work))
       return NO_TIP;
-    /* At the border of what was tried it may lie further on. */
+    /* At the border of what was tried, or well beyond where it was expected, it may lie further on. */
     remaining--;
     double off = found[0] - end_mm;
-    int inside = off > rules[0] + 0.2 && off < rules[1] - 0.2;
+    int inside = off > rules[0] + 0.2 && off < g->beyond_end_mm;
     if (inside || remaining == 0 || !(found[0] > g->tip_before_mm && found[0] < arc[n - 1] - g->tip_beyond_mm))
       return FOUND;
     end_mm = found[0];

@@ -15,6 +15,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from needletrack.errors import NeedleNotFound
+from needletrack.geometry.spline import arc_length
 from needletrack.geometry.stereo import StereoRig
 from needletrack.kernels import address, call, two_tip_views
 from needletrack.records import Appearance, Float, Image, Reason
@@ -77,6 +78,8 @@ _FARTHER_MM, _FARTHEST_ADVANCE_MM = 5.0, 8.0
 ADVANCE_SIGMA_MM_S = 18.0
 # The tip is looked for this far beyond where the needle was followed to, in so many rounds.
 TIP_REACH_MM, TIP_ROUNDS = 12.0, 4
+# Where it is found so far beyond that end, what lies beyond it is looked at as well.
+BEYOND_END_MM = 0.8
 # Beyond its end a curve goes on with the bend of so much of it, mm.
 PARABOLA_MM = 12.0
 MIN_DEPTH_MM = 20.0
@@ -115,7 +118,9 @@ class GlanceParameters:
 class Steady:
     """A needle that was seen whole in the pair before: its curve (N, 3), what it looked like, how its tip is shaped.
 
-    since_s: how long ago that was; advance_mm: how far its tip comes in that time.
+    since_s: how long ago that was; advance_mm: how far its tip comes in that time. length_mm: where the tip is expected
+    from the base, which the end of a curve that was looked at already is not; None: advance_mm beyond its end.
+    is_same_pair: it was seen in the very images that are looked at, which then are not to be told twice.
     """
 
     points_mm: Float
@@ -123,6 +128,8 @@ class Steady:
     taper_mm: float
     since_s: float
     advance_mm: float
+    length_mm: float | None = None
+    is_same_pair: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -152,6 +159,8 @@ def glance(images: Images, rig: StereoRig, steady: Steady, parameters: GlancePar
     now.before_mm, now.before = kept.at(points_mm), len(points_mm)
     now.advance_mm, now.taper_mm, now.since_s = steady.advance_mm, steady.taper_mm, steady.since_s
     now.foreseen_sigma_mm = ADVANCE_SIGMA_MM_S * steady.since_s
+    if steady.length_mm is not None:
+        now.foreseen_off_mm = steady.length_mm - (float(arc_length(points_mm)[-1]) + steady.advance_mm)
     eyes = two_eyes(images, rig, kept)
     pictures = []
     for view, pose in zip(views, (None, rig.right_from_left), strict=True):
@@ -167,6 +176,7 @@ def glance(images: Images, rig: StereoRig, steady: Steady, parameters: GlancePar
     if answer == _BEYOND:
         # Its tip may have been placed too short before.
         now.advance_mm, now.most_advance_mm, now.foreseen_sigma_mm = _FARTHER_MM, _FARTHEST_ADVANCE_MM, np.inf
+        now.foreseen_off_mm = 0.0
         answer = call("glance", now, eyes, views, found.record)
     if answer == _CLIPPED:
         return None
@@ -210,6 +220,8 @@ class _Glance(ctypes.Structure):
         ("tip_rules", P),
         ("prior", P),
         ("log_prior", D),
+        ("beyond_end_mm", D),
+        ("foreseen_off_mm", D),
         ("foreseen_sigma_mm", D),
         ("tip_rounds", I),
         ("diameter_mm", D),
@@ -324,6 +336,7 @@ def _wanted(parameters: GlanceParameters, appearance: Appearance) -> tuple[_Glan
         tip_rules=kept.at(rules(TRIED_AGAIN_MM, (0.0, np.inf), 0.0, parameters.tip)),
         prior=kept.at(prior),
         log_prior=log_prior,
+        beyond_end_mm=BEYOND_END_MM,
         tip_rounds=TIP_ROUNDS,
         diameter_mm=diameter_mm(appearance, needle),
         line_search_px=parameters.beside.search_px,

@@ -12,7 +12,7 @@ from scipy.ndimage import uniform_filter1d
 
 from needletrack.errors import NeedleNotFound
 from needletrack.geometry.camera import Camera
-from needletrack.geometry.spline import arc_length, cut, resample, spline_basis, unit
+from needletrack.geometry.spline import arc_length, cut, distance_from_curve, resample, spline_basis, unit
 from needletrack.geometry.stereo import StereoRig
 from needletrack.geometry.transform import RigidTransform
 from needletrack.records import Appearance, Float, NeedleTrack, Reason
@@ -31,6 +31,7 @@ from needletrack.tracking.ends import (
 from needletrack.tracking.fit import CurveFit, EndObservation, Ends, FitParameters
 from needletrack.tracking.glance import (
     ADVANCE_SIGMA_MM_S,
+    BEYOND_END_MM,
     MIN_DEPTH_MM,
     MOST_ADVANCE_MM,
     PARABOLA_MM,
@@ -60,6 +61,8 @@ GOES_ON_FROM_MM, GOES_ON_TO_MM, GOES_ON_MM, GOES_ON_SHARE = 3.0, 16.0, 4.0, 0.6
 WIDTH_ALLOWANCE = 1.4
 # No single section has more of a say than these log odds.
 _MOST_ODDS = 30.0
+# A needle that is pushed forward is expected on its own line for so much, mm.
+_MOST_AHEAD_MM = 8.0
 # And once more where it was not within this of the end of the curve.
 _TIP_MOVED_MM = 0.3
 # Where a line is looked for beyond the tip: its blur, and the error of a tip that was found, end before.
@@ -264,7 +267,9 @@ def glanced(
     if steady is None:
         return None
     if first_mm is not None:
-        steady = replace(steady, points_mm=first_mm, advance_mm=0.0)
+        advance_mm = float(np.clip(steady.advance_mm, -MOST_ADVANCE_MM, MOST_ADVANCE_MM))
+        length_mm = float(arc_length(steady.points_mm)[-1]) + advance_mm
+        steady = replace(steady, points_mm=first_mm, advance_mm=0.0, length_mm=length_mm)
     seen = glance(
         images,
         rig,
@@ -284,6 +289,13 @@ def glanced(
         seen.tip_px,
         float(np.clip(seen.support, -_MOST_ODDS, _MOST_ODDS).sum()),
     )
+
+
+def how_far_aside_mm(points_mm: Float, from_mm: Float) -> float:
+    """How far aside a curve (N, 3) lies, at most, of where it was looked for: along another one and beyond its tip."""
+    spacing_mm = float(np.linalg.norm(from_mm[-1] - from_mm[-2]))
+    looked_mm = np.concatenate([from_mm, _beyond(from_mm, round(_MOST_AHEAD_MM / spacing_mm), spacing_mm)])
+    return float(distance_from_curve(points_mm, looked_mm).max())
 
 
 def _with_tip(images: Images, rig: StereoRig, ended: _Ended, models: RefineModels, *, base_is_known: bool) -> Refined:
@@ -350,7 +362,8 @@ def _tip(
     along = np.concatenate([curve, _beyond(curve, round(TIP_REACH_MM / spacing), spacing)])
     arc = arc_length(along)
     end_mm, remaining = float(arc[len(curve) - 1]), TIP_ROUNDS
-    foreseen_mm = (end_mm, np.inf if steady is None else ADVANCE_SIGMA_MM_S * steady.since_s)
+    is_foreseen = steady is not None and not steady.is_same_pair
+    foreseen_mm = (end_mm, ADVANCE_SIGMA_MM_S * steady.since_s if steady is not None and is_foreseen else np.inf)
     while True:
         rows_mm = np.arange(max(0.0, end_mm - BEFORE_MM), min(end_mm + BEYOND_MM, arc[-1]), ROW_MM)
         rows = np.column_stack([np.interp(rows_mm, arc, column) for column in along.T])
@@ -368,9 +381,9 @@ def _tip(
             tried_mm,
             foreseen_mm,
         )
-        # At the border of what was tried it may lie further on.
+        # At the border of what was tried, or well beyond where the curve was followed to, it may lie further on.
         remaining -= 1
-        is_inside = tried_mm[0] + 0.2 < tip.at_mm - end_mm < tried_mm[1] - 0.2
+        is_inside = tried_mm[0] + 0.2 < tip.at_mm - end_mm < BEYOND_END_MM
         if is_inside or remaining == 0 or not BEFORE_MM < tip.at_mm < arc[-1] - BEYOND_MM:
             return tip, along
         end_mm = tip.at_mm
@@ -450,6 +463,7 @@ def _steady(previous: NeedleTrack, since_s: float, models: RefineModels) -> Stea
         taper_mm,
         since_s if since_s > 0 else _USUAL_S,
         0.0 if tip is None or tip.velocity_mm_s is None else float(tip.velocity_mm_s @ tip.direction) * since_s,
+        is_same_pair=since_s <= 0,
     )
 
 

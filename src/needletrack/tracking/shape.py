@@ -51,6 +51,11 @@ class Shape:
         reasons = tuple(reason for reason in Reason if reason in both or reason in self.reasons)
         return replace(self, reasons=reasons, doubts=tuple(reason for reason in Reason if reason in both))
 
+    def weakened(self, reasons: Iterable[Reason]) -> "Shape":
+        """The same shape with further reasons."""
+        both = {*self.reasons, *reasons}
+        return replace(self, reasons=tuple(reason for reason in Reason if reason in both))
+
 
 def judged(refined: Refined, rig: StereoRig, parameters: TrackingParameters, previous: NeedleTrack | None) -> Shape:
     """The refined curve as a shape with its verdict; raises NeedleNotFound where it cannot be the needle."""

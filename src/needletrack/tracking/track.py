@@ -18,7 +18,17 @@ from needletrack.tracking.detect import detect
 from needletrack.tracking.fit import initial_curve
 from needletrack.tracking.match import Candidate
 from needletrack.tracking.parameters import TrackingParameters
-from needletrack.tracking.refine import RefineModels, Traced, glanced, is_line_beyond, refine, settled, trace
+from needletrack.tracking.refine import (
+    Refined,
+    RefineModels,
+    Traced,
+    glanced,
+    how_far_aside_mm,
+    is_line_beyond,
+    refine,
+    settled,
+    trace,
+)
 from needletrack.tracking.shape import Shape, as_track, differ, judged
 from needletrack.tracking.silhouette import make_banks, unit_mm
 from needletrack.tracking.stopwatch import Stopwatch
@@ -32,6 +42,11 @@ _CONFIRMED_SHARE, _CONFIRMED_PX = 0.5, 5.0
 # What is detected so near to a tip, not behind it, and so long may be more of the needle: the far side of a hook.
 _GOES_ON_WITHIN_MM, _GOES_ON_COSINE, _GOES_ON_MM = 40.0, -0.3, 4.0
 _APART_PX = 8.0
+# Tips within so much of each other are the same: an audit confirms one that was followed there, mm.
+_SAME_TIP_MM = 1.0
+# A needle is looked at again, at most so often, where it was found this far aside of where it was looked for, mm; what
+# then still moves so far is not known well enough.
+_MOST_LOOKS, _SETTLED_MM, _UNSETTLED_MM = 4, 0.15, 0.3
 
 
 def track(
@@ -78,31 +93,53 @@ def follow(pair: StereoPair, rig: StereoRig, parameters: TrackingParameters, pre
         with stopwatch("refine"):
             models, since_s = _models(parameters), (pair.captured_at_ns - previous.captured_at_ns) * 1e-9
             refined = glanced(images, rig, models, previous=previous, since_s=since_s)
-            is_glance = refined is not None
             if refined is None:
                 points_mm = previous.curve.points_mm
                 refined = refine(images, rig, points_mm, models, previous=previous, since_s=since_s)
-            shape = judged(refined, rig, parameters, previous)
-            if shape.reasons and is_glance:
-                shape = _looked_at_twice(shape, images, rig, parameters, previous, since_s)
-            shape = shape.doubted(previous.doubts)
+                shape = judged(refined, rig, parameters, previous)
+            else:
+                shape = _settled(refined, images, rig, parameters, previous, since_s)
+            # What was weak is not good again for looking so: it may have slid to what looks like its tip.
+            unconfirmed = (Reason.AMBIGUOUS_SHAPE,) if set(previous.reasons) - {Reason.JUMP} else ()
+            shape = shape.doubted((*previous.doubts, *unconfirmed))
     except NeedleNotFound as lost:
         return NeedleTrack(pair.captured_at_ns, Status.INVALID, (Reason(lost.reason),), timing_ms=stopwatch.elapsed_ms)
     since = previous.since_detection + 1
     return as_track(shape, pair.captured_at_ns, previous, since, Evidence(), stopwatch.elapsed_ms)
 
 
-def _looked_at_twice(
-    shape: Shape, images: Images, rig: StereoRig, parameters: TrackingParameters, previous: NeedleTrack, since_s: float
+def _settled(
+    refined: Refined,
+    images: Images,
+    rig: StereoRig,
+    parameters: TrackingParameters,
+    previous: NeedleTrack,
+    since_s: float,
 ) -> Shape:
-    """A weak shape looked at again from where the first glance put it, if that makes it less weak."""
-    first_mm = shape.curve.points_mm
-    try:
-        refined = glanced(images, rig, _models(parameters), previous=previous, since_s=since_s, first_mm=first_mm)
-        again = None if refined is None else judged(refined, rig, parameters, previous)
-    except NeedleNotFound:
-        return shape
-    return again if again is not None and len(again.reasons) < len(shape.reasons) else shape
+    """What a first glance found, looked at again from there until that changes it no more; raises NeedleNotFound.
+
+    A glance sees a needle well where it looks: one that has moved far is seen better from where it is by now. What
+    still changes after some looks is not known better than that.
+    """
+    assert previous.curve is not None
+    shape, from_mm = judged(refined, rig, parameters, previous), previous.curve.points_mm
+    moved_mm = 0.0
+    for look in range(_MOST_LOOKS):
+        moved_mm = how_far_aside_mm(refined.fit.points_mm, from_mm)
+        if moved_mm < _SETTLED_MM and not (shape.reasons and look == 0):
+            return shape
+        if look + 1 == _MOST_LOOKS:
+            break
+        from_mm = refined.fit.points_mm
+        try:
+            again = glanced(images, rig, _models(parameters), previous=previous, since_s=since_s, first_mm=from_mm)
+            if again is None:
+                break
+            refined, seen = again, judged(again, rig, parameters, previous)
+        except NeedleNotFound:
+            break
+        shape = seen if moved_mm >= _SETTLED_MM or len(seen.reasons) < len(shape.reasons) else shape
+    return shape if moved_mm < _UNSETTLED_MM else shape.weakened([Reason.HIGH_UNCERTAINTY])
 
 
 def search(
@@ -155,13 +192,10 @@ def audit(pair: StereoPair, rig: StereoRig, parameters: TrackingParameters, foll
     curve_mm = own[0][0].curve.points_mm if own else followed.curve.points_mm
     of_it = [_is_of(candidate, curve_mm, rig) for candidate in candidates]
     confirming = max((c.score for c, mine in zip(candidates, of_it, strict=True) if mine), default=0.0)
-    holds = bool(own) and not own[0][0].reasons
-    # A shape that holds is compared with what was detected more clearly than itself; one that does not, with all.
-    rivals = [
-        c
-        for c, mine in zip(candidates, of_it, strict=True)
-        if not (mine and own) and not (holds and c.score < confirming)
-    ]
+    holds = bool(own) and not own[0][0].reasons and _ends_at(own[0][0], followed.curve.points_mm[-1])
+    # A shape that holds, to the tip that was followed, is compared with what was detected more clearly than itself; one
+    # that does not, with all: what lies along it too may be the needle of which this is a part, or that goes astray.
+    rivals = [c for c, mine in zip(candidates, of_it, strict=True) if not (holds and (mine or c.score < confirming))]
     try:
         shape, _ = _best(rivals, own, images, rig, parameters, None, stopwatch)
     except NeedleNotFound:
@@ -215,6 +249,14 @@ def _images(pair: StereoPair, rig: StereoRig) -> Images:
 
 def _differ(track: NeedleTrack, other: NeedleTrack) -> bool:
     return track.curve is None or other.curve is None or differ(track.curve, other.curve)
+
+
+def _ends_alike(shape: Shape, other: Shape) -> bool:
+    return _ends_at(shape, other.curve.points_mm[-1])
+
+
+def _ends_at(shape: Shape, tip_mm: Float) -> bool:
+    return bool(np.linalg.norm(shape.curve.points_mm[-1] - tip_mm) < _SAME_TIP_MM)
 
 
 def _is_of(candidate: Candidate, points_mm: Float, rig: StereoRig) -> bool:
@@ -289,6 +331,9 @@ def _best(
     )
     if not best.reasons and any(not shape.reasons and differ(shape.curve, best.curve) for shape, _ in found):
         best = best.doubted([Reason.AMBIGUOUS_SHAPE])
+    # Fits of one needle that end at different places do not know where it ends.
+    if not best.reasons and any(not shape.reasons and not _ends_alike(shape, best) for shape, _ in found):
+        best = best.doubted([Reason.TIP_NOT_SEEN])
     return best, led_to
 
 

@@ -12,7 +12,7 @@ from needletrack.synthetic.background import Background
 from needletrack.synthetic.needle import NeedleMotion, Wave
 from needletrack.synthetic.render import Material
 from needletrack.synthetic.rig import default_rig
-from needletrack.synthetic.world import DARK_ON_LIGHT, LIGHT_ON_DARK, STEEL, Truth, World
+from needletrack.synthetic.world import DARK_ON_LIGHT, LIGHT_ON_DARK, STEEL, Rod, Truth, World
 from needletrack.tracking.track import track_pair
 
 SIZE_PX = (720, 640)
@@ -84,3 +84,30 @@ def scene(name: str) -> Scene:
 def tracked(name: str) -> NeedleTrack:
     """The track of a named scene, started without memory and with the default parameters."""
     return track_pair(scene(name).pair, RIG)
+
+
+def steered_fast(seed: int) -> World:
+    """A needle that is pushed and drawn back while it bends and its base wanders, by up to 3 mm from pair to pair.
+
+    Of steel, dark or light, before texture, vessels and a rod, as the seed has it.
+    """
+    random = np.random.default_rng(seed)
+    lighting = (STEEL, STEEL, DARK_ON_LIGHT, LIGHT_ON_DARK)[random.integers(4)]
+    needle = NeedleMotion(
+        (random.uniform(-15, 15), -34.0, random.uniform(236, 256)),
+        (random.uniform(-0.4, 0.4), 1.0, random.uniform(-0.3, 0.3)),
+        Wave(random.uniform(45, 70), random.uniform(5, 20), random.uniform(1.5, 4)),
+        bend_per_mm=Wave(random.uniform(0, 0.008), random.uniform(0, 0.006), random.uniform(1.5, 4)),
+        bend_plane_rad=Wave(random.uniform(0, 6), random.uniform(0, 0.5), 3.0),
+        shift_mm=(
+            Wave(0.0, random.uniform(0, 3), 2.0),
+            Wave(0.0, random.uniform(0, 2), 2.5),
+            Wave(0.0, random.uniform(0, 3), 3.0),
+        ),
+    )
+    rods: tuple[Rod, ...] = ()
+    if random.random() < 0.5:
+        heights_mm = random.uniform(-20, 20, 2)
+        rods = (Rod((-45.0, heights_mm[0], 228.0), (45.0, heights_mm[1], 232.0), random.uniform(0.5, 2)),)
+    background = Background(contrast=random.uniform(0, 15), vessels=int(random.integers(0, 7)))
+    return World(default_rig((960, 768)), needle, background, lighting, seed=seed, rods=rods)

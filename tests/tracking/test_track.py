@@ -32,7 +32,15 @@ from needletrack.synthetic.rig import default_rig
 from needletrack.synthetic.world import DARK_ON_LIGHT, LIGHT_ON_DARK, STEEL, Lighting, Rod, World
 from needletrack.tracking.needle import EntrySide
 from needletrack.tracking.parameters import TrackingParameters
-from needletrack.tracking.track import PAIRS_PER_AUDIT, PAIRS_PER_AUDIT_OF_WEAK, audit, follow, track, track_pair
+from needletrack.tracking.track import (
+    PAIRS_PER_AUDIT,
+    PAIRS_PER_AUDIT_OF_WEAK,
+    adopted,
+    audit,
+    follow,
+    track,
+    track_pair,
+)
 
 
 def scored(name: str) -> Score:
@@ -578,6 +586,22 @@ def test_a_track_that_is_weak_is_audited_sooner() -> None:
     for number in range(1, PAIRS_PER_AUDIT_OF_WEAK + 1):
         weak = track_pair(scene("dark").pair, RIG, strict, weak)
         assert weak.since_detection == number % PAIRS_PER_AUDIT_OF_WEAK
+
+
+def test_only_an_audit_that_is_good_itself_makes_a_weak_track_good_again() -> None:
+    good = tracked("dark")
+    weak = replace(good, status=Status.DEGRADED, reasons=(Reason.HIGH_RESIDUAL,))
+    later = replace(scene("dark").pair, sequence=1)
+    stamped = replace(
+        later,
+        left=replace(later.left, captured_at_ns=good.captured_at_ns + 33_000_000),
+        right=replace(later.right, captured_at_ns=good.captured_at_ns + 33_000_000),
+    )
+    followed = follow(stamped, RIG, TrackingParameters(), weak)
+    assert followed.reasons == (Reason.AMBIGUOUS_SHAPE,)
+    # Audits of the pair before, which come a pair later.
+    assert adopted(followed, good).status is Status.OK
+    assert adopted(followed, weak).reasons == (Reason.AMBIGUOUS_SHAPE,)
 
 
 def hidden(shown: Scene) -> StereoPair:

@@ -100,12 +100,16 @@ def follow(pair: StereoPair, rig: StereoRig, parameters: TrackingParameters, pre
             else:
                 shape = _settled(refined, images, rig, parameters, previous, since_s)
             # What was weak is not good again for looking so: it may have slid to what looks like its tip.
-            unconfirmed = (Reason.AMBIGUOUS_SHAPE,) if set(previous.reasons) - {Reason.JUMP} else ()
-            shape = shape.doubted((*previous.doubts, *unconfirmed))
+            shape = shape.doubted(_doubts_after(previous))
     except NeedleNotFound as lost:
         return NeedleTrack(pair.captured_at_ns, Status.INVALID, (Reason(lost.reason),), timing_ms=stopwatch.elapsed_ms)
     since = previous.since_detection + 1
     return as_track(shape, pair.captured_at_ns, previous, since, Evidence(), stopwatch.elapsed_ms)
+
+
+def _doubts_after(track: NeedleTrack) -> tuple[Reason, ...]:
+    """What is doubtful of a needle that is followed from a track: that it is the needle, where that was weak."""
+    return (*track.doubts, Reason.AMBIGUOUS_SHAPE) if set(track.reasons) - {Reason.JUMP} else track.doubts
 
 
 def _settled(
@@ -214,14 +218,14 @@ def audit(pair: StereoPair, rig: StereoRig, parameters: TrackingParameters, foll
 def adopted(now: NeedleTrack, audited: NeedleTrack) -> NeedleTrack:
     """The track to go on from, of what has been followed until now and what an audit made of it at its own time.
 
-    What an audit of a pair before found in the same place lends its looks and doubts; what it found elsewhere is gone
-    on from instead.
+    What an audit of a pair before found in the same place lends its looks and doubts, and is doubtful where it was weak
+    itself; what it found elsewhere is gone on from instead.
     """
     if audited.captured_at_ns == now.captured_at_ns:
         return replace(audited, timing_ms={**now.timing_ms, **audited.timing_ms})
     if audited.curve is None or now.curve is None or _differ(audited, now):
         return audited
-    doubted = with_doubts(now, audited.doubts)
+    doubted = with_doubts(now, _doubts_after(audited))
     return replace(doubted, appearance=audited.appearance, diameter_mm=audited.diameter_mm, since_detection=0)
 
 

@@ -76,7 +76,7 @@ def start(frames: Path, rig_file: Path) -> dict[str, int]:
         publisher = opened.enter_context(ZenohPublisher(run, service.status, listen=["tcp/127.0.0.1:0"]))
         opened.enter_context(Metrics(service, Surroundings, 0))
         moments["built"] = time.monotonic_ns()
-        tracker.warm_up()
+        tracker.warm_up(within_s=0.0)
         settle_memory()
         moments["warm"] = time.monotonic_ns()
         first = _First(publisher)

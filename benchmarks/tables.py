@@ -160,7 +160,7 @@ def _start(found: Start) -> Titled:
         "imported": "everything is imported",
         "configured": "configuration and rig are read",
         "built": "tracker, service, publisher and metrics are there",
-        "warm": "warm, and the second process is there",
+        "warm": "warm; the second process comes up meanwhile",
         "tracked": "the first track is published",
     }
     for name, title in names.items():

@@ -191,7 +191,9 @@ def _pictures(kept: _Kept, rig: Rig, config: Config, output: Path, name: str) ->
     if kept.best is None:
         return []
     # matplotlib: not needed before, and slow to import.
-    from needletrack.pictures import Moment, timeline_figure, write_pictures, write_png
+    from needletrack.pictures.files import write_pictures
+    from needletrack.pictures.png import write_png
+    from needletrack.pictures.timeline import Moment, timeline_figure
 
     pair, track = kept.best
     if track.evidence.correspondences is None:

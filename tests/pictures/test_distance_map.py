@@ -6,8 +6,9 @@ import pytest
 from matplotlib.colors import to_rgb
 
 from needletrack.geometry.spline import arc_length, tangents
-from needletrack.pictures import distance_map, distance_map_figure, rendered
-from needletrack.pictures.theme import SEEN_COLOR
+from needletrack.pictures.distance_map import distance_map, distance_map_figure
+from needletrack.pictures.palette import SEEN_COLOR
+from needletrack.pictures.png import rendered
 from needletrack.recording.asl import AslRecording
 from needletrack.records import Correspondences, Evidence, NeedleTrack, Reason, Status, StereoPair
 

@@ -9,8 +9,9 @@ from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 
 from needletrack.geometry.spline import tangents
-from needletrack.pictures import overlay_figure, rendered
-from needletrack.pictures.theme import SEEN_COLOR, STATUS_COLOR
+from needletrack.pictures.overlay import overlay_figure
+from needletrack.pictures.palette import SEEN_COLOR, STATUS_COLOR
+from needletrack.pictures.png import rendered
 from needletrack.recording.asl import AslRecording
 from needletrack.records import (
     REASON_MEANING,

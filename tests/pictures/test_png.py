@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from needletrack.errors import NeedletrackError
-from needletrack.pictures import write_png
+from needletrack.pictures.png import write_png
 from needletrack.pictures.theme import Page
 
 

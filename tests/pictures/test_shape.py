@@ -8,7 +8,8 @@ from matplotlib.collections import PathCollection
 from matplotlib.figure import Figure
 from matplotlib.patches import Polygon
 
-from needletrack.pictures import rendered, shape_figure
+from needletrack.pictures.png import rendered
+from needletrack.pictures.shape import shape_figure
 from needletrack.records import NeedleTrack, Reason, Status, StereoPair
 
 TrueTrack = Callable[[int], tuple[NeedleTrack, StereoPair]]

@@ -7,8 +7,9 @@ from matplotlib.axes import Axes
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 
-from needletrack.pictures import Moment, rendered, timeline_figure
-from needletrack.pictures.theme import STATUS_COLOR
+from needletrack.pictures.palette import STATUS_COLOR
+from needletrack.pictures.png import rendered
+from needletrack.pictures.timeline import Moment, timeline_figure
 from needletrack.publish.message import RunContext, Source, TrackMessage
 from needletrack.records import NeedleTrack, Reason, Status, StereoPair
 

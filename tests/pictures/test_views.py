@@ -7,7 +7,7 @@ import pytest
 from matplotlib.colors import to_rgb
 
 from needletrack.geometry.transform import RigidTransform
-from needletrack.pictures.theme import SEEN_COLOR, STATUS_COLOR
+from needletrack.pictures.palette import SEEN_COLOR, STATUS_COLOR
 from needletrack.pictures.views import draw_views
 from needletrack.recording.asl import AslRecording
 from needletrack.records import NeedleTrack, Reason, Status, StereoPair

@@ -4,7 +4,7 @@ from pathlib import Path
 import cv2
 import pytest
 
-from needletrack.pictures import write_pictures
+from needletrack.pictures.files import write_pictures
 from needletrack.recording.asl import AslRecording
 from needletrack.records import NeedleTrack, Reason, Status, StereoPair
 

@@ -154,7 +154,8 @@ class Daemon:
             metrics = opened.enter_context(Metrics(service, self.surroundings, config.daemon.metrics_port))
             if config.daemon.lock_memory:
                 lock_memory()
-            tracker.warm_up()
+            # The second process comes up meanwhile, which takes as long again: the first pairs need not wait for it.
+            tracker.warm_up(within_s=0.0)
             settle_memory()
             opened.enter_context(_Pulse(notifier, service, self._cameras))
             opened.enter_context(desk)

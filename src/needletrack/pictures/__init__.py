@@ -1,41 +1,5 @@
 """Pictures of a track: its curve in both views, its distance map, its shape in space; and a run over time.
 
-Figures are matplotlib's, made without pyplot: no window, no global state.
+Figures are matplotlib's, made without pyplot: no window, no global state. Each module is imported by itself: the daemon
+draws its overlays (`views.py`) without matplotlib, which takes half a second and 30 MB to load.
 """
-
-from pathlib import Path
-
-from needletrack.geometry.stereo import StereoRig
-from needletrack.pictures.distance_map import DistanceMap, distance_map, distance_map_figure
-from needletrack.pictures.overlay import overlay_figure
-from needletrack.pictures.png import rendered, write_png
-from needletrack.pictures.shape import shape_figure
-from needletrack.pictures.timeline import Moment, timeline_figure
-from needletrack.records import NeedleTrack, StereoPair
-
-__all__ = [
-    "DistanceMap",
-    "Moment",
-    "distance_map",
-    "distance_map_figure",
-    "overlay_figure",
-    "rendered",
-    "shape_figure",
-    "timeline_figure",
-    "write_pictures",
-    "write_png",
-]
-
-
-def write_pictures(track: NeedleTrack, pair: StereoPair, rig: StereoRig, folder: Path | str, stem: str) -> list[Path]:
-    """Write <stem>-overlay.png, <stem>-distance-map.png and <stem>-shape.png, with or without a shape.
-
-    Makes the folder where there is none. Raises NeedletrackError where a file cannot be written.
-    """
-    folder = Path(folder)
-    figures = {
-        "overlay": overlay_figure(track, pair, rig),
-        "distance-map": distance_map_figure(track, rig),
-        "shape": shape_figure(track),
-    }
-    return [write_png(figure, folder / f"{stem}-{name}.png") for name, figure in figures.items()]

@@ -11,17 +11,8 @@ from scipy.spatial import cKDTree
 from needletrack.geometry.epipolar import epipolar_distance_map_px, epipolar_distance_px
 from needletrack.geometry.spline import arc_length, resample, tangents
 from needletrack.geometry.stereo import StereoRig
-from needletrack.pictures.theme import (
-    EMPTY_PX,
-    HEADING_PX,
-    MUTED,
-    PAGE,
-    RULE,
-    SEEN_COLOR,
-    TEXT,
-    Page,
-    number,
-)
+from needletrack.pictures.palette import MUTED, PAGE, RULE, SEEN_COLOR, TEXT
+from needletrack.pictures.theme import EMPTY_PX, HEADING_PX, Page, number
 from needletrack.records import Correspondences, Float, NeedleTrack, frozen_array
 
 WIDTH_PX, HEIGHT_PX = 1200, 1370

@@ -13,10 +13,9 @@ from needletrack.geometry.camera import Camera
 from needletrack.geometry.spline import arc_length
 from needletrack.geometry.stereo import StereoRig
 from needletrack.geometry.transform import RigidTransform
-from needletrack.pictures.theme import (
+from needletrack.pictures.palette import (
     BASE,
     DETECTED,
-    MARGIN_PX,
     MUTED,
     PAGE,
     RULE,
@@ -25,9 +24,8 @@ from needletrack.pictures.theme import (
     STATUS_COLOR,
     TEXT,
     TIP,
-    Page,
-    number,
 )
+from needletrack.pictures.theme import MARGIN_PX, Page, number
 from needletrack.records import (
     REASON_MEANING,
     Centerline,

@@ -15,19 +15,8 @@ from matplotlib.ticker import MaxNLocator
 from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection  # type: ignore[import-untyped]
 
 from needletrack.geometry.spline import tangents, unit
-from needletrack.pictures.theme import (
-    BASE,
-    EMPTY_PX,
-    HEADING_PX,
-    MUTED,
-    PAGE,
-    PANEL,
-    RULE,
-    TEXT,
-    TIP,
-    Page,
-    number,
-)
+from needletrack.pictures.palette import BASE, MUTED, PAGE, PANEL, RULE, TEXT, TIP
+from needletrack.pictures.theme import EMPTY_PX, HEADING_PX, Page, number
 from needletrack.records import Float, NeedleCurve, NeedleTrack
 
 WIDTH_PX, HEIGHT_PX = 1570, 1570

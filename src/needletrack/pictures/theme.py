@@ -1,7 +1,6 @@
 """The look that all pictures share: a dark page measured in pixels, its colours, its heading."""
 
-from collections.abc import Mapping, Sequence
-from types import MappingProxyType
+from collections.abc import Sequence
 from typing import Literal
 
 from matplotlib.artist import Artist
@@ -9,23 +8,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import FancyBboxPatch
 
+from needletrack.pictures.palette import MUTED, PAGE, PANEL, RULE, STATUS_COLOR, TEXT
 from needletrack.records import NeedleTrack, Status
-
-PAGE = "#0d1117"
-PANEL = "#161b22"
-RULE = "#30363d"
-TEXT = "#f0f6fc"
-MUTED = "#9da7b3"
-DETECTED = "#ffffff"
-BASE = "#f0f6fc"
-TIP = "#ff5d8f"
-
-STATUS_COLOR: Mapping[Status, str] = MappingProxyType(
-    {Status.OK: "#3fb950", Status.DEGRADED: "#e3a008", Status.INVALID: "#f85149"}
-)
-# Apart in hue and in lightness, so that they stay apart for colour-blind readers.
-SEEN_COLOR: Mapping[int, str] = MappingProxyType({2: "#22d3ee", 1: "#f5b041", 0: "#e040fb"})
-SEEN_MEANING: Mapping[int, str] = MappingProxyType({2: "seen by both cameras", 1: "by one", 0: "by none"})
 
 MARGIN_PX = 28
 HEADING_PX = 112

@@ -8,16 +8,8 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.patches import Patch
 
-from needletrack.pictures.theme import (
-    HEADING_PX,
-    MARGIN_PX,
-    MUTED,
-    RULE,
-    SEEN_COLOR,
-    STATUS_COLOR,
-    TEXT,
-    Page,
-)
+from needletrack.pictures.palette import MUTED, RULE, SEEN_COLOR, STATUS_COLOR, TEXT
+from needletrack.pictures.theme import HEADING_PX, MARGIN_PX, Page
 from needletrack.records import Float, NeedleTrack, Status, frozen_array
 
 WIDTH_PX = 1500

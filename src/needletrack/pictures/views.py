@@ -3,12 +3,11 @@
 import cv2
 import numpy as np
 import numpy.typing as npt
-from matplotlib.colors import to_rgb
 
 from needletrack.geometry.camera import Camera
 from needletrack.geometry.stereo import StereoRig
 from needletrack.geometry.transform import RigidTransform
-from needletrack.pictures.theme import BASE, SEEN_COLOR, STATUS_COLOR, TIP
+from needletrack.pictures.palette import BASE, SEEN_COLOR, STATUS_COLOR, TIP
 from needletrack.records import Float, Image, NeedleTrack, StereoPair
 
 # OpenCV draws at this fraction of a pixel.
@@ -52,5 +51,5 @@ def _view(track: NeedleTrack, image: Image, camera: Camera, camera_from_left: Ri
 
 
 def _bgr(color: str) -> tuple[int, int, int]:
-    red, green, blue = (round(255 * share) for share in to_rgb(color))
+    red, green, blue = bytes.fromhex(color.removeprefix("#"))
     return blue, green, red

@@ -105,15 +105,6 @@ class _View:
         return len(self.background) // 2
 
 
-def clipped_share(images: tuple[Image, Image], rig: StereoRig, points_mm: Float) -> Float:
-    """Share (2,) of the pixels on a curve (N, 3) that are clipped in each view."""
-    shares = []
-    for image, camera, px in zip(images, (rig.left, rig.right), rig.project(points_mm), strict=True):
-        column, row = np.rint(px[camera.contains(px)]).astype(np.int64).T
-        shares.append(float(np.mean(image[row, column] >= CLIPPED_GRAY)) if len(row) else 0.0)
-    return np.array(shares)
-
-
 def clipped_axis(
     images: tuple[Image, Image],
     rig: StereoRig,

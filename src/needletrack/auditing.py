@@ -60,11 +60,13 @@ class _Follower:
         self._seen = None
         return self._remembered(search(pair, self._rig, self._parameters))
 
-    def go_on(self, pair: StereoPair, previous: NeedleTrack, found: NeedleTrack | None) -> NeedleTrack:
-        """The track of a pair after `previous`; found: what a search has since made of a pair before."""
+    def go_on(
+        self, pair: StereoPair, previous: NeedleTrack, found: NeedleTrack | None, asked: NeedleTrack | None
+    ) -> NeedleTrack:
+        """The track of a pair after `previous`; found: what a search since made of a pair before, tracked `asked`."""
         is_from_found = found is not None and found.curve is not None
         if found is not None and is_from_found:
-            previous = found if previous.curve is None else adopted(previous, found)
+            previous = found if previous.curve is None else adopted(previous, found, asked)
         track = self._followed(pair, previous)
         if found is not None and is_from_found:
             track = replace(track, searched_sequence=found.searched_sequence)
@@ -155,7 +157,8 @@ class AuditedTracker:
             self._asked, self._since_audit = None, 0
             track = self._follower.begin(pair)
         else:
-            track = self._follower.go_on(pair, previous, self._found())
+            asked = None if self._asked is None else self._asked[1]
+            track = self._follower.go_on(pair, previous, self._found(), asked)
         self._since_audit += 1
         self._look_again(pair, track)
         return track
@@ -230,7 +233,7 @@ class RepeatedTracker:
             # Searches are gone on from in the order in which they were asked for.
             self._kept = {ns: kept for ns, kept in self._kept.items() if searched_ns is None or ns > searched_ns}
             found = None if asked is None else looked_again(*asked, self._rig, self._parameters)
-            track = self._follower.go_on(pair, previous, found)
+            track = self._follower.go_on(pair, previous, found, None if asked is None else asked[1])
         if now_ns in self._wanted_ns:
             self._kept[now_ns] = (pair, track)
         return track

@@ -23,7 +23,7 @@ from tests.tracking.scenes import (
 
 from needletrack.geometry import spline
 from needletrack.geometry.spline import distance_from_curve
-from needletrack.records import Clock, Frame, Image, NeedleTrack, Reason, Status, StereoPair
+from needletrack.records import Clock, Evidence, Frame, Image, NeedleCurve, NeedleTrack, Reason, Status, StereoPair
 from needletrack.scoring import Score, Summary, TrueShape, score
 from needletrack.synthetic.background import Background
 from needletrack.synthetic.needle import NeedleMotion, Wave
@@ -602,6 +602,28 @@ def test_only_an_audit_that_is_good_itself_makes_a_weak_track_good_again() -> No
     # Audits of the pair before, which come a pair later.
     assert adopted(followed, good).status is Status.OK
     assert adopted(followed, weak).reasons == (Reason.AMBIGUOUS_SHAPE,)
+
+
+def test_an_audit_that_ends_the_needle_elsewhere_is_gone_on_from() -> None:
+    # Followed to 4 mm before its tip, along the same needle: the audit of the pair before comes a pair later.
+    audited = tracked("dark")
+    assert audited.curve is not None
+    curve = audited.curve
+    short = replace(
+        audited,
+        curve=NeedleCurve(
+            curve.points_mm[:-4],
+            curve.sigma_mm[:-4],
+            curve.seen[:-4],
+            curve.curvature_per_mm[:-4],
+            curve.length_mm - 4.0,
+        ),
+        evidence=Evidence(),
+    )
+    now = replace(short, captured_at_ns=short.captured_at_ns + 33_000_000)
+    assert adopted(now, audited, short) is audited
+    # Where it confirms the end that was followed there, what has been followed since stands.
+    assert adopted(now, short, short).curve is now.curve
 
 
 def hidden(shown: Scene) -> StereoPair:

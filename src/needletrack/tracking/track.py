@@ -215,15 +215,18 @@ def audit(pair: StereoPair, rig: StereoRig, parameters: TrackingParameters, foll
     return replace(track, tip=replace(track.tip, velocity_mm_s=followed.tip.velocity_mm_s))
 
 
-def adopted(now: NeedleTrack, audited: NeedleTrack) -> NeedleTrack:
+def adopted(now: NeedleTrack, audited: NeedleTrack, followed: NeedleTrack | None = None) -> NeedleTrack:
     """The track to go on from, of what has been followed until now and what an audit made of it at its own time.
 
     What an audit of a pair before found in the same place lends its looks and doubts, and is doubtful where it was weak
-    itself; what it found elsewhere is gone on from instead.
+    itself; what it found elsewhere, or found to end elsewhere than was followed to that pair, is gone on from instead.
     """
     if audited.captured_at_ns == now.captured_at_ns:
         return replace(audited, timing_ms={**now.timing_ms, **audited.timing_ms})
     if audited.curve is None or now.curve is None or _differ(audited, now):
+        return audited
+    ends_mm = [each.curve.points_mm[-1] for each in (audited, followed) if each is not None and each.curve is not None]
+    if len(ends_mm) == 2 and np.linalg.norm(ends_mm[0] - ends_mm[1]) >= _SAME_TIP_MM:
         return audited
     doubted = with_doubts(now, _doubts_after(audited))
     return replace(doubted, appearance=audited.appearance, diameter_mm=audited.diameter_mm, since_detection=0)

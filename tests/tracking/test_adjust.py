@@ -159,16 +159,6 @@ def test_what_was_known_of_the_needle_before_is_used() -> None:
     np.testing.assert_array_equal(again.fit.points_mm, one.fit.points_mm)
 
 
-def test_a_part_is_the_same_points() -> None:
-    found = adjusted(scene("dark").images, shaft_mm("dark"))
-    part = found.part(10, 30)
-    np.testing.assert_array_equal(part.fit.points_mm, found.fit.points_mm[10:30])
-    np.testing.assert_array_equal(part.support, found.support[:, 10:30])
-    for view, whole in zip(part.observed, found.observed, strict=True):
-        np.testing.assert_array_equal(view.offset_px, whole.offset_px[10:30])
-    assert part.appearance == found.appearance
-
-
 def test_beside_the_needle_nothing_holds_a_curve() -> None:
     # 12 mm aside only the background is to be seen.
     beside_mm = shaft_mm("dark") + np.array([12.0, 0.0, 0.0])

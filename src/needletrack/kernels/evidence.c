@@ -298,7 +298,7 @@ static void bell(double expected, double spread, double low, double step, int64_
   *first = i + 1;
 }
 
-/* What each section contributes where the axis is expected, px: see `silhouette._sites` and `AxisEvidence.support`.
+/* What each section contributes where the axis is expected, px: see `silhouette.AxisEvidence.offsets`.
 
    grid = (low, step, s) of the shifts, and (low, step, f) of the finer ones. least_gain, least_sigma, used and
    clutter_factor as named there; doubtful (n,): where the last applies. sigma is infinite where the section says

@@ -118,10 +118,9 @@ static int anything_beyond(const Grow *g, const Eye *eyes, const double *points,
 
 static int grown(const Grow *g, const Eye *eyes, Grown *o) {
   int64_t count, remaining = g->rounds, reach = 0;
-  size_t kept = taken();
   double *part = TAKE(double, 3 * o->room), length_mm = 0;
   if (!part) return NO_MEMORY;
-  kept = taken();
+  size_t kept = taken();
   double *points = evenly(g->points_mm, g->n, g->spacing_mm, 0, &count);
   if (!points) return NO_MEMORY;
   Adjust now = *g->rough;

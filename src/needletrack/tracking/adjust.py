@@ -98,28 +98,6 @@ class Adjusted:
     shines: Mask
     flanks: Flanks | None = None
 
-    def part(self, start: int, stop: int) -> "Adjusted":
-        """The points start <= i < stop alone."""
-        fit = self.fit
-        cut = slice(start, stop)
-        left, right = self.observed
-        return Adjusted(
-            CurveFit(
-                fit.parameters[cut],
-                fit.control_mm,
-                fit.covariance_mm2,
-                fit.points_mm[cut],
-                fit.residual_px[:, cut],
-                fit.rms_px,
-                fit.streak_misfit,
-            ),
-            (left.part(cut), right.part(cut)),
-            self.appearance,
-            self.support[:, cut],
-            self.shines[:, cut],
-            self.flanks,
-        )
-
 
 def adjust(
     images: Images,

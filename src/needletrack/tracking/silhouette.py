@@ -103,10 +103,6 @@ class AxisOffsets:
         """Where the view shows the needle, (N,) bool."""
         return np.isfinite(self.sigma_px)
 
-    def part(self, cut: slice | Int) -> "AxisOffsets":
-        """The points of the cut alone."""
-        return AxisOffsets(self.center_px[cut], self.normal[cut], self.offset_px[cut], self.sigma_px[cut])
-
 
 def unit_mm(needle: Needle) -> float:
     """Length across the needle of one unit of `evidence.py`, mm."""

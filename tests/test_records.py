@@ -141,6 +141,7 @@ def points(count: int, columns: int = 2) -> Float:
         (lambda: curve(sigma_mm=np.ones(4)), "sigma_mm"),
         (lambda: curve(seen=np.full(4, 2)), "seen"),
         (lambda: curve(curvature_per_mm=np.zeros((5, 1))), "curvature_per_mm"),
+        (lambda: curve(velocity_mm_s=np.zeros((4, 2))), "velocity_mm_s"),
         (lambda: tip(position_mm=np.zeros(2)), "position_mm"),
         (lambda: tip(direction=np.zeros(4)), "direction"),
         (lambda: tip(orientation_xyzw=np.zeros(3)), "orientation_xyzw"),
@@ -161,6 +162,7 @@ def test_wrong_shapes_are_refused_by_name(build: Callable[[], object], complaint
     [
         (frame(0), "image"),
         (curve(), "points_mm"),
+        (curve(velocity_mm_s=np.ones((5, 3))), "velocity_mm_s"),
         (tip(velocity_mm_s=np.ones(3)), "velocity_mm_s"),
         (Evidence(axis_residual_px=np.zeros((2, 5))), "axis_residual_px"),
     ],

@@ -232,7 +232,8 @@ class NeedleCurve:
     """The needle's axis in space, base -> tip, evenly spaced along the arc.
 
     points_mm (N, 3); sigma_mm (N,) square root of the larger eigenvalue of the covariance across
-    the tangent; seen (N,) number of cameras that saw the point; curvature_per_mm (N,).
+    the tangent; seen (N,) number of cameras that saw the point; curvature_per_mm (N,); velocity_mm_s (N, 3) at which
+    its points come aside, None where that is unknown.
     """
 
     points_mm: Float
@@ -240,6 +241,7 @@ class NeedleCurve:
     seen: Int
     curvature_per_mm: Float
     length_mm: float
+    velocity_mm_s: Float | None = None
 
     def __post_init__(self) -> None:
         points = frozen_array(self.points_mm, (None, 3), "points_mm")
@@ -248,6 +250,8 @@ class NeedleCurve:
         object.__setattr__(self, "sigma_mm", frozen_array(self.sigma_mm, (n,), "sigma_mm"))
         object.__setattr__(self, "seen", frozen_array(self.seen, (n,), "seen", np.int64))
         object.__setattr__(self, "curvature_per_mm", frozen_array(self.curvature_per_mm, (n,), "curvature_per_mm"))
+        if self.velocity_mm_s is not None:
+            object.__setattr__(self, "velocity_mm_s", frozen_array(self.velocity_mm_s, (n, 3), "velocity_mm_s"))
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,18 +1,18 @@
-"""A needle that was seen whole in the pair before, looked at once: against truth, and against the thorough look."""
+"""A needle that was seen whole in the pair before, looked at again: against truth, and against the thorough look."""
 
 from dataclasses import replace
 from functools import cache
 
 import numpy as np
 import pytest
-from tests.tracking.scenes import ARC, RIG, WORLDS, scene, seen_at, tracked
+from tests.tracking.scenes import ARC, RIG, WORLDS, Scene, scene, seen_at, tracked
 
 from needletrack.errors import NeedleNotFound
 from needletrack.geometry import spline
 from needletrack.geometry.spline import distance_from_curve
 from needletrack.records import Frame, NeedleTrack, Reason, Status, StereoPair
 from needletrack.scoring import TrueShape, score
-from needletrack.tracking.glance import Glance, GlanceParameters, Steady, glance
+from needletrack.tracking.glance import MOST_LOOKS, SETTLED_MM, Glance, GlanceParameters, Steady, glance
 from needletrack.tracking.parameters import TrackingParameters
 from needletrack.tracking.track import follow
 
@@ -113,3 +113,42 @@ def test_a_curve_behind_the_cameras_is_refused() -> None:
     with pytest.raises(NeedleNotFound) as lost:
         glance(scene("dark").images, RIG, replace(away, points_mm=away.points_mm - [0.0, 0.0, 300.0]), PARAMETERS)
     assert lost.value.reason == Reason.OUTSIDE_WORKSPACE
+
+
+# Half of its own width aside: seen at once, but not well.
+FAR_MM = (0.5, 0.0, 0.2)
+
+
+@cache
+def far_away() -> Scene:
+    base_mm = (np.array(ARC.base_mm) + FAR_MM).tolist()
+    return seen_at(replace(WORLDS["dark"], needle=replace(ARC, base_mm=tuple(base_mm))), STEP_S)
+
+
+def test_what_has_moved_far_is_looked_at_until_it_stays() -> None:
+    shown, before = far_away(), steady(tracked("dark"))
+    once = glance(shown.images, RIG, before, PARAMETERS, most_looks=1)
+    found = glance(shown.images, RIG, before, PARAMETERS)
+    assert once is not None
+    assert found is not None
+    assert (once.looks, once.aside_mm > SETTLED_MM) == (1, True)
+    assert 1 < found.looks <= MOST_LOOKS
+    assert found.aside_mm < SETTLED_MM
+    errors_mm = [np.median(distance_from_curve(g.fit.points_mm, shown.truth.centerline_mm)) for g in (once, found)]
+    assert errors_mm[1] < 0.03
+    assert errors_mm[1] < errors_mm[0]
+
+
+def test_further_looks_are_glances_from_where_the_one_before_ended() -> None:
+    shown, before = far_away(), steady(tracked("dark"))
+    found = glance(shown.images, RIG, before, PARAMETERS)
+    assert found is not None
+    length_mm, by_hand, from_here = float(spline.arc_length(before.points_mm)[-1]), None, before
+    for _ in range(found.looks):
+        by_hand = glance(shown.images, RIG, from_here, PARAMETERS, most_looks=1)
+        assert by_hand is not None
+        from_here = replace(before, points_mm=by_hand.fit.points_mm, length_mm=length_mm)
+    assert by_hand is not None
+    np.testing.assert_allclose(found.fit.points_mm, by_hand.fit.points_mm, atol=1e-9)
+    np.testing.assert_allclose(found.fit.covariance_mm2, by_hand.fit.covariance_mm2, rtol=1e-6, atol=1e-12)
+    assert found.tip == by_hand.tip

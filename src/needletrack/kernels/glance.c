@@ -17,6 +17,9 @@ typedef struct {
   /* How the curve is sampled. */
   /* A needle that is white along more than this share of it is another matter. */
   double white_share;
+  /* It is looked at again, at most so often, where it lies so far aside of where it was looked for. */
+  int64_t most_looks;
+  double settled_mm;
   double spacing_mm, section_mm, most_advance_mm, beyond_mm, parabola_mm, least_depth_mm, least_length_mm;
   int64_t width_step;
   /* The tip. */
@@ -42,6 +45,9 @@ typedef struct {
   double rms_px, streak_misfit;
   double tip[8], tip_px[4];
   int64_t is_free;
+  /* How often it was looked at, and how far aside of where it was looked for last it lies. */
+  int64_t looks;
+  double aside_mm;
 } Found;
 
 /* Half widths of the needle (n,) before its tip, as indices; -1 where it is thinner than all of them. */
@@ -185,7 +191,24 @@ static int tip_of(const Glance *g, const Eye *eyes, TipView *views, const double
   }
 }
 
-static int glanced(const Glance *g, const Eye *eyes, TipView *views, Found *o) {
+/* How far aside of points (n, 3) the same points of a curve have moved, at most. */
+static double farthest_aside(const double *points, const double *moved, int64_t n) {
+  double most = 0;
+  for (int64_t i = 0; i < n; i++) {
+    const double *a = points + 3 * (i > 0 ? i - 1 : 0), *b = points + 3 * (i + 1 < n ? i + 1 : i);
+    double square = 0, slid = 0, off = 0;
+    for (int d = 0; d < 3; d++) {
+      double step = moved[3 * i + d] - points[3 * i + d];
+      square += (b[d] - a[d]) * (b[d] - a[d]), slid += (b[d] - a[d]) * step, off += step * step;
+    }
+    off -= slid * slid / (square > 1e-300 ? square : 1e-300);
+    most = off > most ? off : most;
+  }
+  return sqrt(most);
+}
+
+/* One look. Of a curve that will be looked at again no more is told than its points. */
+static int glanced(const Glance *g, const Eye *eyes, TipView *views, int is_last, Found *o) {
   /* Where the needle must be now, and beyond. */
   int64_t more = (int64_t)rint((g->most_advance_mm + g->beyond_mm) / g->spacing_mm), total = g->before + more;
   double *line = TAKE(double, 3 * total), *line_arc = TAKE(double, total);
@@ -285,11 +308,7 @@ static int glanced(const Glance *g, const Eye *eyes, TipView *views, Found *o) {
   if ((failed = come_nearer(&g->spline, &fitting, 2))) return failed;
   curve(fitting.control, fitting.first, fitting.mixing, n, moved);
   lengths(moved, n, moved_arc);
-  double *residual = TAKE(double, 2 * n);
-  if (!residual) return NO_MEMORY;
-  failed = finish_fitting(&g->spline, &fitting, moved, residual, &o->rms_px, &o->streak_misfit, o->covariance_mm2);
-  if (failed) return failed;
-  memcpy(o->control_mm, fitting.control, (size_t)(3 * fitting.m) * sizeof(double));
+  o->aside_mm = farthest_aside(points, moved, index + 1);
 
   /* Cut at the tip. The curve as fitted once more may be a little shorter than it was. */
   double end_mm = tip[0] < moved_arc[n - 1] ? tip[0] : moved_arc[n - 1];
@@ -307,6 +326,14 @@ static int glanced(const Glance *g, const Eye *eyes, TipView *views, Found *o) {
   if (!cut_mixing) return NO_MEMORY;
   basis(o->parameters, count, fitting.m, 0, cut_first, cut_mixing);
   curve(fitting.control, cut_first, cut_mixing, count, o->points_mm);
+  o->count = count, o->control_count = fitting.m;
+  if (!is_last && o->aside_mm >= g->settled_mm) return FOUND;
+
+  double *residual = TAKE(double, 2 * n);
+  if (!residual) return NO_MEMORY;
+  failed = finish_fitting(&g->spline, &fitting, moved, residual, &o->rms_px, &o->streak_misfit, o->covariance_mm2);
+  if (failed) return failed;
+  memcpy(o->control_mm, fitting.control, (size_t)(3 * fitting.m) * sizeof(double));
   /* What was seen of a section is told of the point of the curve next to it. */
   for (int64_t i = 0, near = 0; i < count; i++) {
     while (near + 1 < n && fabs(fitting.u[near + 1] - o->parameters[i]) <= fabs(fitting.u[near] - o->parameters[i])) near++;
@@ -317,7 +344,6 @@ static int glanced(const Glance *g, const Eye *eyes, TipView *views, Found *o) {
       o->support[v * o->room + i] = told[v].support[from];
     }
   }
-  o->count = count, o->control_count = fitting.m;
 
   /* Whether the end is free. */
   double begin = tip[0] - g->beside_before_mm, finish = tip[0] + g->beside_beyond_mm;
@@ -339,9 +365,39 @@ typedef struct {
   Found *found;
 } Call;
 
+/* Looks from where the one before found the needle, until it stays there or was looked at so often. */
+static int settled(const Call *call, int64_t most_looks) {
+  Glance now = *call->wanted;
+  Found *o = call->found;
+  size_t before_any = taken();
+  double *arc = TAKE(double, now.before > o->room ? now.before : o->room), *line = TAKE(double, 3 * o->room);
+  if (!line) return NO_MEMORY;
+  lengths(now.before_mm, now.before, arc);
+  double most = now.most_advance_mm, advance = now.advance_mm < -most ? -most : now.advance_mm > most ? most : now.advance_mm;
+  double foreseen = arc[now.before - 1] + advance + now.foreseen_off_mm;
+  for (int64_t look = 1;; look++) {
+    size_t mark = taken();
+    int is_last = look == most_looks, answer = glanced(&now, call->eyes, call->views, is_last, o);
+    if (answer == NO_MEMORY) return answer;
+    give_back(mark);
+    if (answer != FOUND && look > 1) {
+      /* What another look does not see is known as well as it was before. */
+      give_back(before_any);
+      return settled(call, look - 1);
+    }
+    o->looks = look;
+    if (answer != FOUND || is_last || o->aside_mm < now.settled_mm) return answer;
+    /* Where its tip is expected stays what its motion foretold: what was just seen is not to be told twice. */
+    memcpy(line, o->points_mm, (size_t)(3 * o->count) * sizeof *line);
+    lengths(line, o->count, arc);
+    now.before_mm = line, now.before = o->count, now.advance_mm = 0;
+    now.foreseen_off_mm = foreseen - arc[o->count - 1];
+  }
+}
+
 static int once(void *what) {
-  Call *call = what;
-  return glanced(call->wanted, call->eyes, call->views, call->found);
+  const Call *call = what;
+  return settled(call, call->wanted->most_looks);
 }
 
 /* See `glance.glance`. views: with the pictures of the one shape of end that the needle has. */

@@ -1,4 +1,4 @@
-"""One look at a needle that was seen whole in the pair before, where it must be now.
+"""A needle that was seen whole in the pair before, looked at where it must be now.
 
 What it looks like and where its base is are known; the curve is known but for how it moved since. So one look across
 it, a fit, its tip, and the fit once more to the tip tell all that there is. It is one call into the compiled kernel
@@ -76,6 +76,8 @@ MOST_ADVANCE_MM, _BEYOND_MM = 3.0, 3.0
 _FARTHER_MM, _FARTHEST_ADVANCE_MM = 5.0, 8.0
 # Nor is it off from where its motion would take it by more than a few of these, a second.
 ADVANCE_SIGMA_MM_S = 18.0
+# A needle is looked at again, at most so often, where it was found this far aside of where it was looked for, mm.
+MOST_LOOKS, SETTLED_MM = 4, 0.15
 # The tip is looked for this far beyond where the needle was followed to, in so many rounds.
 TIP_REACH_MM, TIP_ROUNDS = 12.0, 4
 # Where it is found so far beyond that end, what lies beyond it is looked at as well.
@@ -136,7 +138,8 @@ class Steady:
 class Glance:
     """The curve base -> tip; where each view shows it (2, N); log odds (2, N) of it; its tip, whether that is free.
 
-    tip_px (2, 2): the tip as the left and the right view alone place it, raw px.
+    tip_px (2, 2): the tip as the left and the right view alone place it, raw px. looks: how often it was looked at,
+    each time where it had been found; aside_mm: how far, at most, it lies aside of where it was looked for last.
     """
 
     fit: CurveFit
@@ -145,10 +148,17 @@ class Glance:
     tip: TipFit
     tip_is_free: bool
     tip_px: Float
+    looks: int
+    aside_mm: float
 
 
-def glance(images: Images, rig: StereoRig, steady: Steady, parameters: GlanceParameters) -> Glance | None:
+def glance(
+    images: Images, rig: StereoRig, steady: Steady, parameters: GlanceParameters, most_looks: int = MOST_LOOKS
+) -> Glance | None:
     """The needle where it was moved to since; None where it is so bright that it is white.
+
+    It is looked at again, most_looks times at most, from where it was found, until it is found there: it is seen well
+    only where it is looked for.
 
     Raises NeedleNotFound where the views do not show it, or its tip has gone further than was looked.
     """
@@ -158,6 +168,7 @@ def glance(images: Images, rig: StereoRig, steady: Steady, parameters: GlancePar
     points_mm = np.ascontiguousarray(steady.points_mm)
     now.before_mm, now.before = kept.at(points_mm), len(points_mm)
     now.advance_mm, now.taper_mm, now.since_s = steady.advance_mm, steady.taper_mm, steady.since_s
+    now.most_looks = most_looks
     now.foreseen_sigma_mm = ADVANCE_SIGMA_MM_S * steady.since_s
     if steady.length_mm is not None:
         now.foreseen_off_mm = steady.length_mm - (float(arc_length(points_mm)[-1]) + steady.advance_mm)
@@ -200,6 +211,8 @@ class _Glance(ctypes.Structure):
         ("taper_mm", D),
         ("since_s", D),
         ("white_share", D),
+        ("most_looks", I),
+        ("settled_mm", D),
         ("spacing_mm", D),
         ("section_mm", D),
         ("most_advance_mm", D),
@@ -258,6 +271,8 @@ class _Found(ctypes.Structure):
         ("tip", D * 8),
         ("tip_px", D * 4),
         ("is_free", I),
+        ("looks", I),
+        ("aside_mm", D),
     ]
 
 
@@ -296,7 +311,16 @@ class _Room:
         )
         tip = tip_fit(np.array(record.tip), (taper_mm,))
         tip_px = np.array(record.tip_px).reshape(2, 2)
-        return Glance(fit, self._shown[:, :count], self._support[:, :count], tip, bool(record.is_free), tip_px)
+        return Glance(
+            fit,
+            self._shown[:, :count],
+            self._support[:, :count],
+            tip,
+            bool(record.is_free),
+            tip_px,
+            int(record.looks),
+            float(record.aside_mm),
+        )
 
 
 @lru_cache(maxsize=16)
@@ -316,6 +340,7 @@ def _wanted(parameters: GlanceParameters, appearance: Appearance) -> tuple[_Glan
         axis=axis,
         spline=spline,
         white_share=WORTH_A_LOOK,
+        settled_mm=SETTLED_MM,
         spacing_mm=parameters.spacing_mm,
         section_mm=_SECTION_SHARE * parameters.spacing_mm,
         most_advance_mm=MOST_ADVANCE_MM,

@@ -12,7 +12,7 @@ from scipy.ndimage import uniform_filter1d
 
 from needletrack.errors import NeedleNotFound
 from needletrack.geometry.camera import Camera
-from needletrack.geometry.spline import arc_length, cut, distance_from_curve, resample, spline_basis, unit
+from needletrack.geometry.spline import arc_length, cut, resample, spline_basis, unit
 from needletrack.geometry.stereo import StereoRig
 from needletrack.geometry.transform import RigidTransform
 from needletrack.records import Appearance, Float, NeedleTrack, Reason
@@ -34,6 +34,7 @@ from needletrack.tracking.glance import (
     BEYOND_END_MM,
     MIN_DEPTH_MM,
     MOST_ADVANCE_MM,
+    MOST_LOOKS,
     PARABOLA_MM,
     TIP_REACH_MM,
     TIP_ROUNDS,
@@ -42,6 +43,7 @@ from needletrack.tracking.glance import (
     glance,
 )
 from needletrack.tracking.grow import Growth, grow
+from needletrack.tracking.motion import foreseen_mm
 from needletrack.tracking.needle import Needle, Positive, Workspace
 from needletrack.tracking.profile import Mask
 from needletrack.tracking.silhouette import AxisOffsets, diameter_mm
@@ -61,8 +63,6 @@ GOES_ON_FROM_MM, GOES_ON_TO_MM, GOES_ON_MM, GOES_ON_SHARE = 3.0, 16.0, 4.0, 0.6
 WIDTH_ALLOWANCE = 1.4
 # No single section has more of a say than these log odds.
 _MOST_ODDS = 30.0
-# A needle that is pushed forward is expected on its own line for so much, mm.
-_MOST_AHEAD_MM = 8.0
 # And once more where it was not within this of the end of the curve.
 _TIP_MOVED_MM = 0.3
 # Where a line is looked for beyond the tip: its blur, and the error of a tip that was found, end before.
@@ -140,6 +140,15 @@ class Refined:
         if self.calibration_mm2 is not None:
             covariance = covariance + self.calibration_mm2[-1]
         return np.asarray((covariance + covariance.T) / 2)
+
+
+@dataclass(frozen=True, slots=True)
+class Glanced:
+    """What glances at a needle made of it: how many looks they were, how far aside of the last it still lies, mm."""
+
+    refined: Refined
+    looks: int
+    aside_mm: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -256,11 +265,13 @@ def glanced(
     previous: NeedleTrack,
     since_s: float,
     first_mm: Float | None = None,
-) -> Refined | None:
-    """The needle where it has moved since the pair before, looked at once: a hundredth of what `refine` takes.
+    most_looks: int = MOST_LOOKS,
+) -> Glanced | None:
+    """The needle where it has moved since the pair before, looked at there: a hundredth of what `refine` takes.
 
     What it looks like and where its base is are known. None where a glance does not do: its tip was never seen, or it
-    is so bright that it is white. first_mm: the curve (N, 3) to the tip at which a first glance put it already.
+    is so bright that it is white. first_mm: the curve (N, 3) to the tip at which a first glance put it already;
+    most_looks: how often it is looked at.
     Raises NeedleNotFound where the views do not show it.
     """
     steady = _steady(previous, since_s, models)
@@ -275,10 +286,11 @@ def glanced(
         rig,
         steady,
         GlanceParameters(models.needle, models.fit, models.ends, models.tip, models.beside, models.refine.spacing_mm),
+        most_looks,
     )
     if seen is None:
         return None
-    return Refined(
+    refined = Refined(
         seen.fit,
         seen.shown,
         steady.appearance,
@@ -289,13 +301,7 @@ def glanced(
         seen.tip_px,
         float(np.clip(seen.support, -_MOST_ODDS, _MOST_ODDS).sum()),
     )
-
-
-def how_far_aside_mm(points_mm: Float, from_mm: Float) -> float:
-    """How far aside a curve (N, 3) lies, at most, of where it was looked for: along another one and beyond its tip."""
-    spacing_mm = float(np.linalg.norm(from_mm[-1] - from_mm[-2]))
-    looked_mm = np.concatenate([from_mm, _beyond(from_mm, round(_MOST_AHEAD_MM / spacing_mm), spacing_mm)])
-    return float(distance_from_curve(points_mm, looked_mm).max())
+    return Glanced(refined, seen.looks, seen.aside_mm)
 
 
 def _with_tip(images: Images, rig: StereoRig, ended: _Ended, models: RefineModels, *, base_is_known: bool) -> Refined:
@@ -458,7 +464,7 @@ def _steady(previous: NeedleTrack, since_s: float, models: RefineModels) -> Stea
     if taper_mm is None or taper_mm not in models.needle.tip_tapers_mm:
         return None
     return Steady(
-        previous.curve.points_mm,
+        foreseen_mm(previous.curve, since_s),
         previous.appearance,
         taper_mm,
         since_s if since_s > 0 else _USUAL_S,

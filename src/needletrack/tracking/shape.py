@@ -23,6 +23,7 @@ from needletrack.records import (
 )
 from needletrack.tracking.fit import CurveFit
 from needletrack.tracking.gates import weaknesses
+from needletrack.tracking.motion import moved_aside_mm
 from needletrack.tracking.parameters import TrackingParameters
 from needletrack.tracking.refine import Refined
 
@@ -135,21 +136,25 @@ def as_track(
     fit, points_mm = shape.refined.fit, shape.curve.points_mm
     at_base = spline_basis(fit.parameters[:1], len(fit.control_mm), derivative=1)
     along = np.stack([unit(at_base.curve(fit.control_mm)[0]), _tip_direction(shape.curve)])
-    tip = None
+    curve, tip, since_s = shape.curve, None, _since_s(captured_at_ns, previous)
+    if since_s is not None and previous is not None and previous.curve is not None:
+        curve = replace(curve, velocity_mm_s=moved_aside_mm(points_mm, previous.curve.points_mm) / since_s)
     if Reason.TIP_NOT_SEEN not in shape.reasons:
         tip = TipPose(
             points_mm[-1],
             along[1],
             orientation_along(along[1]),
             shape.refined.tip_covariance_mm2,
-            _velocity_mm_s(points_mm[-1], captured_at_ns, previous),
+            None
+            if since_s is None or previous is None or previous.tip is None
+            else np.asarray((points_mm[-1] - previous.tip.position_mm) / since_s),
             int(shape.curve.seen[-1]),
         )
     return NeedleTrack(
         captured_at_ns,
         Status.DEGRADED if shape.reasons else Status.OK,
         shape.reasons,
-        shape.curve,
+        curve,
         tip,
         BasePose(points_mm[0], along[0]),
         shape.refined.diameter_mm,
@@ -180,10 +185,9 @@ def _tip_direction(curve: NeedleCurve) -> Float:
     return unit(np.linalg.lstsq(design, points_mm[last], rcond=None)[0][1])
 
 
-def _velocity_mm_s(tip_mm: Float, captured_at_ns: int, previous: NeedleTrack | None) -> Float | None:
-    if previous is None or previous.tip is None or previous.status is not Status.OK:
+def _since_s(captured_at_ns: int, previous: NeedleTrack | None) -> float | None:
+    """How long after the track before, where that tells how the needle moves."""
+    if previous is None or previous.status is not Status.OK:
         return None
     elapsed_ns = captured_at_ns - previous.captured_at_ns
-    if not 0 < elapsed_ns <= _MAX_VELOCITY_INTERVAL_NS:
-        return None
-    return np.asarray((tip_mm - previous.tip.position_mm) / (elapsed_ns * 1e-9))
+    return elapsed_ns * 1e-9 if 0 < elapsed_ns <= _MAX_VELOCITY_INTERVAL_NS else None

@@ -16,14 +16,15 @@ from needletrack.records import Evidence, Float, Frame, Image, NeedleTrack, Reas
 from needletrack.tracking.adjust import Images
 from needletrack.tracking.detect import detect
 from needletrack.tracking.fit import initial_curve
+from needletrack.tracking.glance import MOST_LOOKS, SETTLED_MM
 from needletrack.tracking.match import Candidate
+from needletrack.tracking.motion import moving_like
 from needletrack.tracking.parameters import TrackingParameters
 from needletrack.tracking.refine import (
-    Refined,
+    Glanced,
     RefineModels,
     Traced,
     glanced,
-    how_far_aside_mm,
     is_line_beyond,
     refine,
     settled,
@@ -44,9 +45,8 @@ _GOES_ON_WITHIN_MM, _GOES_ON_COSINE, _GOES_ON_MM = 40.0, -0.3, 4.0
 _APART_PX = 8.0
 # Tips within so much of each other are the same: an audit confirms one that was followed there, mm.
 _SAME_TIP_MM = 1.0
-# A needle is looked at again, at most so often, where it was found this far aside of where it was looked for, mm; what
-# then still moves so far is not known well enough.
-_MOST_LOOKS, _SETTLED_MM, _UNSETTLED_MM = 4, 0.15, 0.3
+# What still moves so far when it was looked at as often as it is looked at is not known well enough, mm.
+_UNSETTLED_MM = 0.3
 
 
 def track(
@@ -92,13 +92,13 @@ def follow(pair: StereoPair, rig: StereoRig, parameters: TrackingParameters, pre
     try:
         with stopwatch("refine"):
             models, since_s = _models(parameters), (pair.captured_at_ns - previous.captured_at_ns) * 1e-9
-            refined = glanced(images, rig, models, previous=previous, since_s=since_s)
-            if refined is None:
+            seen = glanced(images, rig, models, previous=previous, since_s=since_s)
+            if seen is None:
                 points_mm = previous.curve.points_mm
                 refined = refine(images, rig, points_mm, models, previous=previous, since_s=since_s)
                 shape = judged(refined, rig, parameters, previous)
             else:
-                shape = _settled(refined, images, rig, parameters, previous, since_s)
+                shape = _settled(seen, images, rig, parameters, previous, since_s)
             # What was weak is not good again for looking so: it may have slid to what looks like its tip.
             shape = shape.doubted(_doubts_after(previous))
     except NeedleNotFound as lost:
@@ -113,7 +113,7 @@ def _doubts_after(track: NeedleTrack) -> tuple[Reason, ...]:
 
 
 def _settled(
-    refined: Refined,
+    first: Glanced,
     images: Images,
     rig: StereoRig,
     parameters: TrackingParameters,
@@ -122,28 +122,31 @@ def _settled(
 ) -> Shape:
     """What a first glance found, looked at again from there until that changes it no more; raises NeedleNotFound.
 
-    A glance sees a needle well where it looks: one that has moved far is seen better from where it is by now. What
-    still changes after some looks is not known better than that.
+    What was found only weakly is worth a second look as well. What still changes after some looks is not known better
+    than that.
     """
-    assert previous.curve is not None
-    shape, from_mm = judged(refined, rig, parameters, previous), previous.curve.points_mm
-    moved_mm = 0.0
-    for look in range(_MOST_LOOKS):
-        moved_mm = how_far_aside_mm(refined.fit.points_mm, from_mm)
-        if moved_mm < _SETTLED_MM and not (shape.reasons and look == 0):
-            return shape
-        if look + 1 == _MOST_LOOKS:
-            break
-        from_mm = refined.fit.points_mm
+    glance, looks = first, first.looks
+    shape = judged(glance.refined, rig, parameters, previous)
+    while looks < MOST_LOOKS and (glance.aside_mm >= SETTLED_MM or (shape.reasons and looks == 1)):
         try:
-            again = glanced(images, rig, _models(parameters), previous=previous, since_s=since_s, first_mm=from_mm)
+            again = glanced(
+                images,
+                rig,
+                _models(parameters),
+                previous=previous,
+                since_s=since_s,
+                first_mm=glance.refined.fit.points_mm,
+                most_looks=MOST_LOOKS - looks,
+            )
             if again is None:
                 break
-            refined, seen = again, judged(again, rig, parameters, previous)
+            seen = judged(again.refined, rig, parameters, previous)
         except NeedleNotFound:
             break
-        shape = seen if moved_mm >= _SETTLED_MM or len(seen.reasons) < len(shape.reasons) else shape
-    return shape if moved_mm < _UNSETTLED_MM else shape.weakened([Reason.HIGH_UNCERTAINTY])
+        if glance.aside_mm >= SETTLED_MM or len(seen.reasons) < len(shape.reasons):
+            shape = seen
+        glance, looks = again, looks + again.looks
+    return shape if glance.aside_mm < _UNSETTLED_MM else shape.weakened([Reason.HIGH_UNCERTAINTY])
 
 
 def search(
@@ -212,7 +215,10 @@ def audit(pair: StereoPair, rig: StereoRig, parameters: TrackingParameters, foll
     track = replace(track, searched_sequence=pair.sequence)
     if track.tip is None or followed.tip is None or _differ(track, followed):
         return track
-    return replace(track, tip=replace(track.tip, velocity_mm_s=followed.tip.velocity_mm_s))
+    assert track.curve is not None
+    assert followed.curve is not None
+    moving = moving_like(track.curve, followed.curve)
+    return replace(track, curve=moving, tip=replace(track.tip, velocity_mm_s=followed.tip.velocity_mm_s))
 
 
 def adopted(now: NeedleTrack, audited: NeedleTrack, followed: NeedleTrack | None = None) -> NeedleTrack:

@@ -151,3 +151,31 @@ def test_unit_vectors_keep_their_direction(points: Float) -> None:
     units = spline.unit(vectors)
     np.testing.assert_allclose(np.linalg.norm(units, axis=1), 1.0)
     np.testing.assert_allclose(units * np.linalg.norm(vectors, axis=1, keepdims=True), vectors, atol=1e-9)
+
+
+@given(
+    st.lists(st.floats(-30.0, 30.0), min_size=3, max_size=3),
+    st.floats(-50.0, 0.0),
+    st.floats(1.0, 40.0),
+    st.integers(3, 40),
+)
+def test_a_parabola_is_found_again(terms: list[float], start: float, length: float, count: int) -> None:
+    at = np.linspace(start, start + length, count)
+    values = np.vander(at, 3, increasing=True) @ np.array([terms, terms[::-1]]).T
+    found = spline.parabola(at, values)
+    assert found.shape == (3, 2)
+    scale = 1 + np.abs(values).max()
+    np.testing.assert_allclose(np.vander(at, 3, increasing=True) @ found, values, atol=1e-6 * scale)
+
+
+def test_a_parabola_is_the_nearest_one() -> None:
+    at = np.linspace(-19.0, -3.0, 17)
+    values = np.random.default_rng(5).normal(size=(17, 3))
+    expected = np.linalg.lstsq(np.vander(at, 3, increasing=True), values, rcond=None)[0]
+    np.testing.assert_allclose(spline.parabola(at, values), expected, rtol=1e-9, atol=1e-12)
+
+
+@pytest.mark.parametrize("at", [[0.0, 1.0], [-17.3, -3.1], [0.1, 0.1, 0.7, 0.7]])
+def test_two_places_hold_no_parabola(at: list[float]) -> None:
+    with pytest.raises(ValueError, match="places hold no parabola"):
+        spline.parabola(at, np.zeros((len(at), 3)))

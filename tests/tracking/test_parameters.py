@@ -53,7 +53,7 @@ def test_lengths_angles_and_pixels_say_their_unit() -> None:
             assert name.endswith(units) or name in plain, name
 
 
-@pytest.mark.parametrize("model", set(models(TrackingParameters)), ids=lambda model: model.__name__)
+@pytest.mark.parametrize("model", dict.fromkeys(models(TrackingParameters)), ids=lambda model: model.__name__)
 def test_models_are_frozen_and_refuse_what_they_do_not_know(model: type[BaseModel]) -> None:
     whole = model(min=0.0, max=1.0) if model is Range else model()
     name = next(iter(model.model_fields))

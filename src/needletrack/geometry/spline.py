@@ -37,6 +37,18 @@ def _cut(points: Float, arc: Float, start: float, stop: float, count: int) -> Fl
     return out
 
 
+def parabola(at: npt.ArrayLike, values: npt.ArrayLike) -> Float:
+    """Terms (3, D), constant first, of the parabolas nearest to values (N, D) at places (N,), by least squares.
+
+    Raises ValueError where the places hold no parabola.
+    """
+    places, array = (np.ascontiguousarray(each, dtype=np.float64) for each in (at, values))
+    terms = np.empty((3, array.shape[1]))
+    if call("parabola", places, array, *array.shape, terms):
+        raise ValueError(f"{len(places)} places hold no parabola: it takes three that differ")
+    return terms
+
+
 def unit(vectors: npt.ArrayLike) -> Float:
     """Vectors (..., D) scaled to length one; a vector of length zero stays zero."""
     array = np.asarray(vectors, dtype=np.float64)

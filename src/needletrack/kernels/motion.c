@@ -3,41 +3,15 @@
 
 enum { TERMS = 3, PLACES = 32 };
 
-/* What a parabola through values (PLACES, 3) at even shares of a length is made of, (TERMS, 3). */
-static void parabola(const double (*values)[3], double (*terms)[3]) {
-  double normal[TERMS][TERMS] = {{0}}, inverse[TERMS][TERMS] = {{0}}, right[TERMS][3] = {{0}};
-  for (int i = 0; i < PLACES; i++) {
-    double x = (double)i / (PLACES - 1), power[TERMS] = {1, x, x * x};
-    for (int a = 0; a < TERMS; a++) {
-      for (int b = 0; b < TERMS; b++) normal[a][b] += power[a] * power[b];
-      for (int d = 0; d < 3; d++) right[a][d] += power[a] * values[i][d];
-    }
-  }
-  for (int a = 0; a < TERMS; a++) inverse[a][a] = 1;
-  for (int a = 0; a < TERMS; a++) {
-    double pivot = normal[a][a];
-    for (int b = 0; b < TERMS; b++) normal[a][b] /= pivot, inverse[a][b] /= pivot;
-    for (int other = 0; other < TERMS; other++) {
-      double share = normal[other][a];
-      if (other == a) continue;
-      for (int b = 0; b < TERMS; b++) normal[other][b] -= share * normal[a][b], inverse[other][b] -= share * inverse[a][b];
-    }
-  }
-  for (int a = 0; a < TERMS; a++)
-    for (int d = 0; d < 3; d++) {
-      terms[a][d] = 0;
-      for (int b = 0; b < TERMS; b++) terms[a][d] += inverse[a][b] * right[b][d];
-    }
-}
-
 /* How far aside (n, 3) each point of a curve (n, 3) has come since another one (m, 3), smoothly along it: a parabola
    over its length. Returns 1 where there is no memory. */
 static int moved_aside(const double *before, int64_t m, const double *now, int64_t n, double *out) {
-  double *arc_before = TAKE(double, m), *arc = TAKE(double, n), at[PLACES], was[PLACES][3], is[PLACES][3], terms[TERMS][3];
+  double *arc_before = TAKE(double, m), *arc = TAKE(double, n), at[PLACES], share[PLACES], was[PLACES][3],
+         is[PLACES][3], terms[TERMS][3];
   if (!arc) return NO_MEMORY;
   lengths(before, m, arc_before), lengths(now, n, arc);
   double common = arc_before[m - 1] < arc[n - 1] ? arc_before[m - 1] : arc[n - 1];
-  for (int i = 0; i < PLACES; i++) at[i] = common * (double)i / (PLACES - 1);
+  for (int i = 0; i < PLACES; i++) share[i] = (double)i / (PLACES - 1), at[i] = common * share[i];
   interpolated(before, arc_before, m, at, PLACES, was[0]);
   interpolated(now, arc, n, at, PLACES, is[0]);
   for (int i = 0; i < PLACES; i++) {
@@ -48,7 +22,7 @@ static int moved_aside(const double *before, int64_t m, const double *now, int64
     slid /= square > 1e-300 ? square : 1e-300;
     for (int d = 0; d < 3; d++) was[i][d] = is[i][d] - was[i][d] - slid * along[d];
   }
-  parabola((const double (*)[3])was, terms);
+  if (parabola(share, was[0], PLACES, 3, terms[0])) return NOT_HELD;
   for (int64_t i = 0; i < n; i++) {
     double x = common > 0 ? arc[i] / common : 0;
     for (int d = 0; d < 3; d++) out[3 * i + d] = terms[0][d] + x * (terms[1][d] + x * terms[2][d]);

@@ -51,3 +51,33 @@ EXPORT void distances_from(const double *points, int64_t count, const double *li
     out[i] = sqrt(least);
   }
 }
+
+/* The terms (3, d), constant first, of the parabolas that are nearest to values (n, d) at places (n,). Returns 1 where
+   the places hold no parabola. */
+EXPORT int parabola(const double *at, const double *values, int64_t n, int64_t d, double *terms) {
+  enum { TERMS = 3 };
+  double normal[TERMS][TERMS] = {{0}}, whole[TERMS];
+  memset(terms, 0, (size_t)(TERMS * d) * sizeof *terms);
+  for (int64_t i = 0; i < n; i++) {
+    double power[TERMS] = {1, at[i], at[i] * at[i]};
+    for (int a = 0; a < TERMS; a++) {
+      for (int b = 0; b < TERMS; b++) normal[a][b] += power[a] * power[b];
+      for (int64_t k = 0; k < d; k++) terms[a * d + k] += power[a] * values[i * d + k];
+    }
+  }
+  for (int a = 0; a < TERMS; a++) whole[a] = normal[a][a];
+  /* Gauss and Jordan; the matrix is positive definite, so that no pivot need be looked for. */
+  for (int a = 0; a < TERMS; a++) {
+    double pivot = normal[a][a];
+    if (!(pivot > 1e-13 * whole[a])) return 1;
+    for (int b = 0; b < TERMS; b++) normal[a][b] /= pivot;
+    for (int64_t k = 0; k < d; k++) terms[a * d + k] /= pivot;
+    for (int other = 0; other < TERMS; other++) {
+      double share = normal[other][a];
+      if (other == a) continue;
+      for (int b = 0; b < TERMS; b++) normal[other][b] -= share * normal[a][b];
+      for (int64_t k = 0; k < d; k++) terms[other * d + k] -= share * terms[a * d + k];
+    }
+  }
+  return 0;
+}

@@ -134,9 +134,9 @@ class Refined:
         """Covariance (3, 3) of the tip: across the needle that of the curve, along it that of the end's picture."""
         at_tip = spline_basis(self.fit.parameters[-1:], len(self.fit.control_mm), derivative=1)
         along = unit(at_tip.curve(self.fit.control_mm)[0])
-        left, right = self.tip.each_mm
-        along_mm = np.hypot(np.sum(np.array(self.tip.sigma_mm) ** -2.0) ** -0.5, abs(left - right) / 2)
-        covariance = self.fit.point_covariance_mm2[-1] + along_mm**2 * np.outer(along, along)
+        (left, right), (left_sigma, right_sigma) = self.tip.each_mm, self.tip.sigma_mm
+        along_mm2 = 1 / (left_sigma**-2 + right_sigma**-2) + ((left - right) / 2) ** 2
+        covariance = self.fit.point_covariance_mm2[-1] + along_mm2 * np.outer(along, along)
         if self.calibration_mm2 is not None:
             covariance = covariance + self.calibration_mm2[-1]
         return np.asarray((covariance + covariance.T) / 2)

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from needletrack.geometry.epipolar import sampson_distance_px
-from needletrack.geometry.spline import arc_length, spline_basis, unit
+from needletrack.geometry.spline import arc_length, parabola, spline_basis, unit
 from needletrack.geometry.stereo import StereoRig
 from needletrack.geometry.transform import orientation_along
 from needletrack.kernels import call
@@ -176,13 +176,13 @@ def _tip_direction(curve: NeedleCurve) -> Float:
     arc = arc_length(points_mm)
     before = arc - arc[-1]
     # A parabola follows a needle's turn over about half a radian.
-    bend = float(np.median(curve.curvature_per_mm[before >= -_DIRECTION_MM]))
+    bend = float(np.median(curve.curvature_per_mm[np.searchsorted(before, -_DIRECTION_MM) :]))
     length_mm = min(_DIRECTION_MM - _DIRECTION_SKIP_MM, max(_LEAST_DIRECTION_MM, _PARABOLA_RAD / max(bend, 1e-6)))
-    last = (before >= -_DIRECTION_SKIP_MM - length_mm) & (before <= -_DIRECTION_SKIP_MM)
-    if last.sum() < 5:
+    first = int(np.searchsorted(before, -_DIRECTION_SKIP_MM - length_mm))
+    stop = int(np.searchsorted(before, -_DIRECTION_SKIP_MM, side="right"))
+    if stop - first < 5:
         return unit(points_mm[-1] - points_mm[-2])
-    design = np.vander(before[last], 3, increasing=True)
-    return unit(np.linalg.lstsq(design, points_mm[last], rcond=None)[0][1])
+    return unit(parabola(before[first:stop], points_mm[first:stop])[1])
 
 
 def _since_s(captured_at_ns: int, previous: NeedleTrack | None) -> float | None:

@@ -42,8 +42,11 @@ $(INSTALLED): $(PACKAGES) pyproject.toml hatch_build.py $(wildcard src/needletra
 demo: $(INSTALLED)  ## track the bundled recording, watch it arrive over Zenoh, leave pictures in build/demo
 	@$(BIN)/needletrack demo tests/data/recordings/steer-b --output build/demo
 
+# As many processes as cores, one file in one of them; more than four only wait for the disk and for one another.
+PARALLEL = -n logical --maxprocesses 4 --dist loadgroup
+
 test: $(INSTALLED)  ## the quick tests, with coverage
-	$(BIN)/python -m pytest -m "not slow" --cov --cov-report=term
+	$(BIN)/python -m pytest -m "not slow" $(PARALLEL) --cov --cov-report=term
 
 test-slow: $(INSTALLED)  ## the tests marked slow
 	@$(BIN)/python -m pytest -m slow || { code=$$?; [ $$code -eq 5 ] && echo "No test is marked slow." || exit $$code; }

@@ -51,6 +51,7 @@ def test_the_locks_cover_what_pyproject_asks_for() -> None:
     assert runtime.items() | build.items() <= everything.items(), "run make lock"
 
 
+@pytest.mark.slow
 def test_the_wheel_carries_the_typed_package_and_its_licence(tmp_path: Path) -> None:
     command = [sys.executable, "-m", "hatchling", "build", "--target", "wheel", "--directory", str(tmp_path)]
     subprocess.run(command, cwd=ROOT, check=True, capture_output=True)

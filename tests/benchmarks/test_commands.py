@@ -22,6 +22,7 @@ def test_a_bar_is_met_by_its_own_figure_and_missed_beyond_it() -> None:
     assert at_most("time", 2.0, 2.0, " ms").bar == "≤ 2 ms"
 
 
+@pytest.mark.slow
 def test_every_run_leaves_a_record_with_its_bars(tmp_path: Path) -> None:
     command = [*PYTHON, "benchmarks", "--smoke", "--only", "throughput", "--history", str(tmp_path)]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True, timeout=120)

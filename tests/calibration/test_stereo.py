@@ -237,6 +237,7 @@ def test_a_blurred_view_is_left_out() -> None:
     assert "the right picture is blurred: its edges have a sigma of 2.4 px" in calibration.rejected[0].reason
 
 
+@pytest.mark.slow
 def test_motion_between_the_exposures_is_told_from_false_corners() -> None:
     rig = default_rig()
     poses = board_poses(12)

@@ -12,9 +12,9 @@ from functools import cache, cached_property, lru_cache
 
 import numpy as np
 import numpy.typing as npt
-from scipy.interpolate import CubicSpline
 from scipy.special import ndtr
 
+from needletrack.geometry.spline import cubic_interpolation
 from needletrack.kernels import address, call
 from needletrack.records import Appearance, Float
 
@@ -26,6 +26,8 @@ Mask = npt.NDArray[np.bool_]
 REACH, ACROSS_STEP = 8.0, 0.5
 UNITS_PER_MAX_DIAMETER = 6.0
 OFFSETS = np.arange(-REACH, REACH + ACROSS_STEP / 2, ACROSS_STEP)
+# Fine shifts to each shift.
+_FINER = 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,12 +49,12 @@ class Grid:
     @cached_property
     def fine_shifts(self) -> Float:
         """Four (F,) to each of them."""
-        return np.linspace(self.shifts[0], self.shifts[-1], 4 * (len(self.shifts) - 1) + 1)
+        return np.linspace(self.shifts[0], self.shifts[-1], _FINER * (len(self.shifts) - 1) + 1)
 
     @cached_property
     def refine(self) -> Float32:
         """Cubic interpolation (F, S)."""
-        return np.asarray(CubicSpline(self.shifts, np.eye(len(self.shifts)))(self.fine_shifts), dtype=np.float32)
+        return cubic_interpolation(len(self.shifts), _FINER).astype(np.float32)
 
 
 # Where the axis is nearly known; where it is not; and where it has to be found and known at one look.

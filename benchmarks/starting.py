@@ -91,6 +91,9 @@ def main() -> None:
     """Load what the command loads, in its order, start, and print when what was done."""
     began_ns = time.monotonic_ns()
     import needletrack.cli
+    from needletrack.daemon.process import load_without_collecting
+
+    load_without_collecting()
     import needletrack.daemon.logs
     import needletrack.daemon.run  # noqa: F401
 

@@ -240,6 +240,9 @@ def run(rig: RunRig = None, config: ConfigFile = None) -> None:
     Exit codes: 0 it was asked to stop; 1 a defect; 2 configuration, rig, endpoint or folder cannot be used; 3 a camera
     does not do what is configured, or may not be opened; 4 a daemon of the rig runs already.
     """
+    from needletrack.daemon.process import load_without_collecting
+
+    load_without_collecting()
     from needletrack.config import load_config
     from needletrack.daemon.logs import logged
     from needletrack.daemon.run import Daemon, exit_code

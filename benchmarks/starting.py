@@ -95,7 +95,8 @@ def main() -> None:
 
     load_without_collecting()
     import needletrack.daemon.logs
-    import needletrack.daemon.run  # noqa: F401
+    import needletrack.daemon.run
+    import needletrack.terminal  # noqa: F401
 
     imported_ns = time.monotonic_ns()
     print(json.dumps({"interpreter": began_ns, "imported": imported_ns} | start(Path(sys.argv[1]), Path(sys.argv[2]))))

@@ -36,9 +36,9 @@ from needletrack.publish.control import (
     StopRecordingReply,
     StopRecordingRequest,
 )
-from needletrack.publish.keys import DEFAULT_PREFIX, RigKeys
+from needletrack.publish.keys import DEFAULT_ENDPOINT, DEFAULT_PREFIX, RigKeys
 from needletrack.publish.message import StatusMessage, TrackMessage
-from needletrack.publish.session import DEFAULT_ENDPOINT, Mode, NobodyAnswers, direct, open_session
+from needletrack.publish.session import Mode, NobodyAnswers, direct, open_session
 from needletrack.publish.tls import TlsFiles
 from needletrack.records import DropReason
 

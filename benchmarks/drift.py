@@ -12,7 +12,8 @@ from pathlib import Path
 
 import numpy as np
 
-from needletrack.calibration.drift import DriftParameters, DriftState, Motion, effect
+from needletrack.calibration.drift import Motion, effect
+from needletrack.calibration.tips import DriftParameters, DriftState
 from needletrack.calibration.worth import space_grid_mm
 from needletrack.recording.asl import AslRecording
 from needletrack.records import NeedleTrack, Status

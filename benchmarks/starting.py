@@ -91,8 +91,12 @@ def main() -> None:
     """Load what the command loads, in its order, start, and print when what was done."""
     began_ns = time.monotonic_ns()
     import needletrack.cli
+    from needletrack.daemon.process import load_without_collecting
+
+    load_without_collecting()
     import needletrack.daemon.logs
-    import needletrack.daemon.run  # noqa: F401
+    import needletrack.daemon.run
+    import needletrack.terminal  # noqa: F401
 
     imported_ns = time.monotonic_ns()
     print(json.dumps({"interpreter": began_ns, "imported": imported_ns} | start(Path(sys.argv[1]), Path(sys.argv[2]))))

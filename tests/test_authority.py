@@ -16,8 +16,9 @@ from needletrack.cli import app
 from needletrack.config import load_config
 from needletrack.errors import ConfigError, PublishError
 from needletrack.publish.access import access_control
+from needletrack.publish.certificates import name_of
 from needletrack.publish.keys import RigKeys
-from needletrack.publish.tls import TlsFiles, name_of
+from needletrack.publish.tls import TlsFiles
 
 ROLES = ("publisher", "controller", "operator")
 

@@ -8,7 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from needletrack.calibration.drift import DriftParameters, Motion
+from needletrack.calibration.drift import Motion
+from needletrack.calibration.tips import DriftParameters
 from needletrack.errors import CaptureError, RecordingError
 from needletrack.publish.message import RunContext, ServiceState, Source, TrackMessage
 from needletrack.recording.asl import AslRecording

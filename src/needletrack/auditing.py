@@ -7,11 +7,9 @@ tracks, however busy the machine was. So no pair waits for a search but the firs
 """
 
 import copyreg
-import ctypes
 import logging
 import multiprocessing
-import os
-import signal
+import pickle
 import time
 from collections.abc import Mapping
 from dataclasses import replace
@@ -24,6 +22,7 @@ import cv2
 import numpy as np
 from threadpoolctl import threadpool_limits  # type: ignore[import-untyped]
 
+from needletrack.aside import give_way
 from needletrack.records import Frame, NeedleTrack, StereoPair
 from needletrack.rig import Rig
 from needletrack.tracking.parameters import TrackingParameters
@@ -37,7 +36,6 @@ _PAIRS_PER_AUDIT = 5
 # A needle that is lost is looked for where it was for so long, in case something only passed before it.
 _REMEMBERED_NS = 2_000_000_000
 _RESTART_AFTER_S, _STARTS_WITHIN_S, _ENDS_WITHIN_S = 5.0, 30.0, 1.0
-_PR_SET_PDEATHSIG, _NICE = 1, 5
 
 
 def _read_only(values: dict[str, float]) -> MappingProxyType[str, float]:
@@ -257,8 +255,8 @@ class _Auditor:
         context = multiprocessing.get_context("spawn")
         self._pipe, theirs = context.Pipe()
         self._process = context.Process(
-            target=_audit_pairs,
-            args=(rig, parameters, self._memory.name, self._shape, theirs),
+            target=give_way,
+            args=(pickle.dumps((_audit_pairs, (rig, parameters, self._memory.name, self._shape))), theirs),
             name="needletrack-audit",
             daemon=True,
         )
@@ -314,12 +312,6 @@ def _audit_pairs(
     rig: Rig, parameters: TrackingParameters, memory_name: str, shape: tuple[int, int, int], pipe: Connection
 ) -> None:
     """The second process's life: a pair in, a track out."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    # It must not outlive a parent that was killed.
-    ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
-    # Whoever starts it may be tied to a processor of its own, and must not wait for it.
-    os.sched_setaffinity(0, range(os.cpu_count() or 1))
-    os.nice(_NICE)
     cv2.setNumThreads(1)
     # As in the process that follows: matrices as small as ours are slower with two, which wait for one another.
     threadpool_limits(1)

@@ -19,9 +19,9 @@ from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
 from needletrack.errors import PublishError
 from needletrack.publish.access import ROUTER_NAME, Role, access_control, common_name
+from needletrack.publish.certificates import name_of
 from needletrack.publish.keys import DEFAULT_PREFIX, RigKeys
 from needletrack.publish.session import LEASE_MS
-from needletrack.publish.tls import name_of
 
 AUTHORITY_DAYS = 3650
 # X.520's upper bound of a common name.

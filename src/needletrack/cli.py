@@ -14,15 +14,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal, ParamSpec
 
 import typer
-from rich.console import Console
 
 from needletrack import __version__
 from needletrack.errors import CalibrationError, NeedletrackError, RecordingError
-from needletrack.publish.keys import DEFAULT_PREFIX
-from needletrack.publish.session import DEFAULT_ENDPOINT
+from needletrack.publish.keys import DEFAULT_ENDPOINT, DEFAULT_PREFIX
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
+
+    from rich.console import Console
 
     from needletrack.calibration.board import Board
     from needletrack.calibration.bundle import Terms
@@ -111,6 +111,8 @@ def demo(
 
     Played forward and backward in turn, through the live loop and over Zenoh on this machine alone.
     """
+    from rich.console import Console
+
     from needletrack.demo import SubscriberFailed, run_demo
     from needletrack.terminal import Interruption, warnings_shown
 
@@ -166,6 +168,8 @@ def replay(
     by reason. Exit code 0; 1 where no pair could be tracked; 2 where something given cannot be used; 130
     after Ctrl-C, which ends it with what was done so far.
     """
+    from rich.console import Console
+
     from needletrack.config import load_config
     from needletrack.replay import Replay, open_recording
     from needletrack.terminal import Interruption, ProgressBar, described, warnings_shown
@@ -211,6 +215,8 @@ def report(
 
     The page holds all that it shows, about 250 kB for a pair shown in full. Exit codes as of replay.
     """
+    from rich.console import Console
+
     from needletrack.config import load_config
     from needletrack.replay import Replay, open_recording
     from needletrack.report import write_report
@@ -240,6 +246,9 @@ def run(rig: RunRig = None, config: ConfigFile = None) -> None:
     Exit codes: 0 it was asked to stop; 1 a defect; 2 configuration, rig, endpoint or folder cannot be used; 3 a camera
     does not do what is configured, or may not be opened; 4 a daemon of the rig runs already.
     """
+    from needletrack.daemon.process import load_without_collecting
+
+    load_without_collecting()
     from needletrack.config import load_config
     from needletrack.daemon.logs import logged
     from needletrack.daemon.run import Daemon, exit_code
@@ -275,6 +284,8 @@ def record(
     pairs: Annotated[int | None, typer.Option(min=1, help="So many pairs.")] = None,
 ) -> None:
     """Record both cameras, without tracking; a rig is put into the file, and not needed for it."""
+    from rich.console import Console
+
     from needletrack.config import load_config
     from needletrack.daemon.record import record as recorded
     from needletrack.terminal import Interruption, described_skew, warnings_shown
@@ -664,6 +675,8 @@ def calibrate(
     ] = 60,
 ) -> None:
     """Make a rig file from pictures of a checkerboard or a ChArUco board, and a report of what it is worth."""
+    from rich.console import Console
+
     from needletrack.config import load_config
     from needletrack.recording.board import calibrate_from_pictures, open_board_pictures
     from needletrack.report.calibration import write_calibration_report
@@ -723,6 +736,8 @@ def check(
 
     Exit code 0 where they do; 1 where one has moved: calibrate anew, nothing is corrected in silence.
     """
+    from rich.console import Console
+
     from needletrack.config import load_config
     from needletrack.recording.board import check_pictures, open_board_pictures
     from needletrack.replay import rig_at
@@ -787,6 +802,8 @@ def table1(
     repeats: Annotated[int, typer.Option(min=1, help="Runs of each stage; the median counts.")] = 9,
 ) -> None:
     """Repeat Table 1 of the 2017 paper, beside the paper's figures and our method."""
+    from rich.console import Console
+
     from needletrack.table1 import render
     from needletrack.table1 import table1 as measured
 
@@ -820,7 +837,7 @@ def _collect(
     right: Path | None,
     board: "Board",
     settings: "Config",
-    console: Console,
+    console: "Console",
     *,
     stream: Path | None = None,
     live: bool,

@@ -36,10 +36,10 @@ from needletrack.publish.control import (
     StopRecordingReply,
     StopRecordingRequest,
 )
-from needletrack.publish.keys import DEFAULT_PREFIX, RigKeys
+from needletrack.publish.keys import DEFAULT_ENDPOINT, DEFAULT_PREFIX, RigKeys
 from needletrack.publish.message import StatusMessage, TrackMessage
-from needletrack.publish.session import DEFAULT_ENDPOINT, Mode, NobodyAnswers, direct, open_session
-from needletrack.publish.tls import TlsFiles, name_of
+from needletrack.publish.session import Mode, NobodyAnswers, direct, open_session
+from needletrack.publish.tls import TlsFiles
 from needletrack.records import DropReason
 
 if TYPE_CHECKING:
@@ -713,6 +713,8 @@ def _router_and_peers(where: str) -> str:
 
 
 def _ours(tls: TlsFiles) -> str:
+    from needletrack.publish.certificates import name_of  # with cryptography, which only TLS needs
+
     return f"{tls.certificate} is {name_of(tls.check())!r}"
 
 

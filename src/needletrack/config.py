@@ -26,9 +26,8 @@ from pydantic import (
     field_validator,
     model_validator,
 )
-from pydantic_settings import BaseSettings, EnvSettingsSource, SettingsConfigDict, SettingsError
 
-from needletrack.calibration.drift import DriftParameters
+from needletrack.calibration.tips import DriftParameters
 from needletrack.capture.settings import CamerasSettings
 from needletrack.errors import ConfigError
 from needletrack.reading import text_of
@@ -335,14 +334,6 @@ def load_config(path: Path | str | None = None) -> Config:
         raise ConfigError("\n".join(found)) from error
 
 
-class _Environment(BaseSettings, Config):
-    """Config, as pydantic-settings wants it for reading the environment."""
-
-    model_config = SettingsConfigDict(
-        env_prefix=ENVIRONMENT_PREFIX, env_nested_delimiter="__", frozen=True, extra="forbid"
-    )
-
-
 def _read_toml(path: Path) -> dict[str, Any]:
     try:
         return tomllib.loads(text_of(path, _MOST_BYTES))
@@ -374,8 +365,20 @@ def _variables() -> dict[str, tuple[str, ...]]:
 
 
 def _read_environment(variables: dict[str, tuple[str, ...]]) -> dict[str, Any]:
+    if not variables:
+        return {}
+    # It, and all models built once more, take 0.1 s, for which who sets no variable does not wait.
+    from pydantic_settings import BaseSettings, EnvSettingsSource, SettingsConfigDict, SettingsError
+
+    class Environment(BaseSettings, Config):
+        """Config, as pydantic-settings wants it for reading the environment."""
+
+        model_config = SettingsConfigDict(
+            env_prefix=ENVIRONMENT_PREFIX, env_nested_delimiter="__", frozen=True, extra="forbid"
+        )
+
     try:
-        return EnvSettingsSource(_Environment)()
+        return EnvSettingsSource(Environment)()
     except SettingsError as error:
         refused = getattr(error.__cause__, "doc", None)
         name = next((name for name in variables if os.environ[name] == refused), f"{ENVIRONMENT_PREFIX}*")

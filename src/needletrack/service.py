@@ -15,7 +15,7 @@ from typing import NamedTuple, Protocol
 
 from threadpoolctl import threadpool_limits  # type: ignore[import-untyped]
 
-from needletrack.calibration.drift import DriftParameters, DriftState, doubted
+from needletrack.calibration.tips import DriftParameters, DriftState, doubted
 from needletrack.capture.source import FrameSource
 from needletrack.publish.frames import in_published_frame
 from needletrack.publish.message import (

@@ -9,22 +9,24 @@ from dataclasses import replace
 from logging.handlers import MemoryHandler
 from pathlib import Path
 from types import FrameType, TracebackType
-from typing import Self
+from typing import TYPE_CHECKING, Self
 
 import numpy as np
-from pydantic import TypeAdapter
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from needletrack.capture.pairing import SkewReport
 from needletrack.errors import RecordingError
 from needletrack.publish.message import TrackMessage
 from needletrack.records import DropReason, NeedleTrack, Status, StereoPair
 from needletrack.service import RunSummary
-from needletrack.watch import WatchSummary
+
+if TYPE_CHECKING:
+    from pydantic import TypeAdapter
+    from rich.console import Console
+    from rich.progress import Progress
+
+    from needletrack.watch import WatchSummary
 
 _MOST_REASONS = 4
-_SUMMARY = TypeAdapter(WatchSummary)
 
 
 class Interruption:
@@ -66,11 +68,10 @@ class ProgressBar:
     first: the first pair's sequence number; total: pairs to be played.
     """
 
-    def __init__(self, console: Console, first: int, total: int) -> None:
-        columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    def __init__(self, console: "Console", first: int, total: int) -> None:
         # Not console.is_terminal, which FORCE_COLOR makes true of a pipe.
         hidden = not console.file.isatty()
-        self._progress = Progress(*columns, console=console, transient=True, disable=hidden)
+        self._progress = _bar(console, disable=hidden)
         self._task = self._progress.add_task("", total=total)
         self._first = first
 
@@ -90,16 +91,15 @@ class ProgressBar:
 
 
 @contextmanager
-def steps_shown(console: Console, what: str, total: int) -> Iterator[Callable[[int], None]]:
+def steps_shown(console: "Console", what: str, total: int) -> Iterator[Callable[[int], None]]:
     """A bar of so many steps while it lasts; gives what to call with how many are done."""
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=console, transient=True, disable=not console.file.isatty()) as progress:
+    with _bar(console, disable=not console.file.isatty()) as progress:
         task = progress.add_task(what, total=total)
         yield lambda done: progress.update(task, completed=done)
 
 
 @contextmanager
-def warnings_shown(console: Console, *, at_end: bool = False) -> Iterator[None]:
+def warnings_shown(console: "Console", *, at_end: bool = False) -> Iterator[None]:
     """What the package logs within it, on the console; at_end: not before it ends."""
     handler: logging.Handler = _ConsoleHandler(console)
     if at_end:
@@ -146,23 +146,39 @@ def counted(counts: Mapping[DropReason, int] | Mapping[str, int]) -> str:
     return ", ".join(f"{name} {count}" for name, count in sorted(counts.items(), key=lambda entry: -entry[1]))
 
 
-def write_summary(summary: WatchSummary, path: Path) -> None:
+def write_summary(summary: "WatchSummary", path: Path) -> None:
     """Write what was received as JSON; raises RecordingError where the file cannot be written."""
     # pydantic knows no read-only mapping.
     plain = replace(summary, statuses=dict(summary.statuses))
     try:
-        path.write_bytes(_SUMMARY.dump_json(plain, indent=2) + b"\n")
+        path.write_bytes(_summaries().dump_json(plain, indent=2) + b"\n")
     except OSError as error:
         raise RecordingError(f"{path}: the summary cannot be written: {error.strerror or error}") from error
 
 
-def read_summary(path: Path) -> WatchSummary:
+def read_summary(path: Path) -> "WatchSummary":
     """What `write_summary` wrote."""
-    return _SUMMARY.validate_json(path.read_bytes())
+    return _summaries().validate_json(path.read_bytes())
+
+
+def _summaries() -> "TypeAdapter[WatchSummary]":
+    from pydantic import TypeAdapter
+
+    from needletrack.watch import WatchSummary
+
+    return TypeAdapter(WatchSummary)
+
+
+def _bar(console: "Console", *, disable: bool) -> "Progress":
+    # With the rest of rich it takes 0.05 s to load, for which a daemon that shows none does not wait.
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    return Progress(*columns, console=console, transient=True, disable=disable)
 
 
 class _ConsoleHandler(logging.Handler):
-    def __init__(self, console: Console) -> None:
+    def __init__(self, console: "Console") -> None:
         super().__init__()
         self._console = console
 

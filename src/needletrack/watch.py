@@ -17,8 +17,8 @@ from rich.table import Table
 from rich.text import Text
 
 from needletrack.client import Freshness, Health, Received, StatusMessage, Subscriber
-from needletrack.publish.keys import DEFAULT_PREFIX
-from needletrack.publish.session import DEFAULT_ENDPOINT, Mode
+from needletrack.publish.keys import DEFAULT_ENDPOINT, DEFAULT_PREFIX
+from needletrack.publish.session import Mode
 from needletrack.publish.tls import TlsFiles
 from needletrack.records import Status
 

@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.interpolate import CubicSpline
 
 from needletrack.geometry import spline
 from needletrack.records import Float
@@ -179,3 +180,16 @@ def test_a_parabola_is_the_nearest_one() -> None:
 def test_two_places_hold_no_parabola(at: list[float]) -> None:
     with pytest.raises(ValueError, match="places hold no parabola"):
         spline.parabola(at, np.zeros((len(at), 3)))
+
+
+@pytest.mark.parametrize("values", [4, 5, 25, 57])
+@pytest.mark.parametrize("finer", [1, 4])
+def test_interpolation_is_that_of_scipy(values: int, finer: int) -> None:
+    at = np.arange(finer * (values - 1) + 1) / finer
+    expected = CubicSpline(np.arange(values), np.eye(values))(at)
+    np.testing.assert_allclose(spline.cubic_interpolation(values, finer), expected, atol=1e-14)
+
+
+def test_three_values_hold_no_cubic() -> None:
+    with pytest.raises(ValueError, match="at least 4 values"):
+        spline.cubic_interpolation(3, 4)

@@ -5,7 +5,13 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from needletrack.geometry.spline import unit
-from needletrack.geometry.transform import RigidTransform, orientation_along, orthonormalized
+from needletrack.geometry.transform import (
+    RigidTransform,
+    orientation_along,
+    orthonormalized,
+    turned_by,
+    turned_orientation,
+)
 from needletrack.records import Float
 
 Transforms = st.SearchStrategy[RigidTransform]
@@ -114,3 +120,19 @@ def test_orientations_along_the_axes(direction: tuple[float, float, float]) -> N
     frame = Rotation.from_quat(orientation_along(direction)).as_matrix()
     np.testing.assert_allclose(frame[:, 2], direction, atol=1e-8)
     assert np.linalg.det(frame) == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize("angle", [0.0, 1e-12, 1e-6, 0.3, 3.0, np.pi])
+def test_a_turn_is_that_of_scipy(angle: float) -> None:
+    for axis in (np.eye(3)[1], unit(np.array([0.3, -0.5, 0.8]))):
+        expected = Rotation.from_rotvec(angle * axis).as_matrix()
+        np.testing.assert_allclose(turned_by(angle * axis), expected, atol=2e-15)
+
+
+def test_an_orientation_turns_as_scipy_turns_it() -> None:
+    random = np.random.default_rng(1)
+    for turn, before in zip(Rotation.random(200, rng=random), Rotation.random(200, rng=random), strict=True):
+        after = turned_orientation(turn.as_matrix(), before.as_quat())
+        assert np.linalg.norm(after) == pytest.approx(1.0, abs=1e-15)
+        # A quaternion and its negative are the same orientation.
+        np.testing.assert_allclose(Rotation.from_quat(after).as_matrix(), (turn * before).as_matrix(), atol=2e-15)

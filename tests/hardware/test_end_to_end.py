@@ -27,7 +27,7 @@ from tests.hardware.loopback import LEFT, RIGHT, Feed, loopback_nodes
 from needletrack.capture.live import CameraState
 from needletrack.client import Subscriber
 from needletrack.config import load_config
-from needletrack.daemon.record import both_cameras
+from needletrack.daemon.cameras import both_cameras
 from needletrack.daemon.run import ExitCode
 from needletrack.errors import RecordingError
 from needletrack.geometry.spline import distance_from_curve

@@ -33,10 +33,10 @@ from needletrack.client import (
 from needletrack.config import Config, load_config
 from needletrack.errors import PublishError
 from needletrack.publish.control import ControlDesk
-from needletrack.publish.keys import RigKeys
+from needletrack.publish.keys import DEFAULT_ENDPOINT, RigKeys
 from needletrack.publish.publisher import ZenohPublisher
 from needletrack.publish.schema import example_messages, example_run
-from needletrack.publish.session import DEFAULT_ENDPOINT, open_endpoints, open_session
+from needletrack.publish.session import open_endpoints, open_session
 from needletrack.router import serve
 
 CONFIG = Path(__file__).parents[2] / "config"

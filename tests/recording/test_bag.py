@@ -14,10 +14,11 @@ from tests.recording.small_recording import image_of, small_rig, write_recording
 from needletrack.errors import CalibrationError, RecordingError
 from needletrack.recording import bag as bags
 from needletrack.recording.asl import AslRecording
+from needletrack.recording.asl_writer import write_asl
 from needletrack.recording.bag import BagRecording, write_bag
 from needletrack.recording.mcap_file import McapRecording, typestore
 from needletrack.recording.replay import StoredRecording
-from needletrack.recording.stored import open_stored, write_asl
+from needletrack.recording.stored import open_stored
 
 MS = 1_000_000
 STAMPS_NS = [1_000_000_000 + number * 10 * MS for number in range(4)]

@@ -1,17 +1,9 @@
-"""Whether the cameras still stand as they did: from fresh views of a board, and from tracking itself.
-
-A board of known size tells every motion. Tracking tells less. Along a needle, matched points lie on epipolar lines by
-construction; only its tip, which each view finds by itself, may lie off its line. A pitch, a roll away from the middle
-and a vertical shift move it across; a yaw and a shift along the baseline move it along, and change depth and length
-in silence.
-"""
+"""Whether the cameras still stand as they did, from fresh views of a board, which tells every motion."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field
-from scipy.spatial.transform import Rotation
 from scipy.special import chdtri
 
 from needletrack.calibration.board import Board, BoardView
@@ -20,8 +12,8 @@ from needletrack.calibration.worth import Expected, actual, judged
 from needletrack.errors import CalibrationError
 from needletrack.geometry.epipolar import cross_matrix, epipolar_distance_px
 from needletrack.geometry.stereo import StereoRig
-from needletrack.geometry.transform import RigidTransform
-from needletrack.records import Float, NeedleTrack, Reason, Status
+from needletrack.geometry.transform import RigidTransform, turned_by
+from needletrack.records import Float
 
 # Chance alone moves the cameras once in so many checks.
 _FALSE_ALARM = 1e-4
@@ -31,63 +23,6 @@ _BUMP_DEG, _BUMP_MM = 2.0, 5.0
 _CORNER_SIGMA_PX = 0.05
 # A motion that does less than this in space is none, whatever the corners say: neighbouring corners err alike.
 _LEAST_EFFECT_MM = 0.05
-_MAD_SIGMA = 1.4826
-# The standard error of a median is this many times that of a mean.
-_MEDIAN_ERROR = 1.2533
-
-
-class DriftParameters(BaseModel):
-    """When tips that lie off their epipolar lines say that a camera has moved."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-    window_pairs: int = Field(60, ge=5, description="So many of the last tips that both views found are looked at.")
-    least_pairs: int = Field(10, ge=5, description="Fewer than this say nothing.")
-    max_offset_px: float = Field(
-        0.3, gt=0, description="Greatest median distance of the right tip from its epipolar line, px."
-    )
-    clear_sigmas: float = Field(4.0, gt=0, description="It must exceed its own standard error by this factor.")
-
-
-@dataclass(frozen=True, slots=True)
-class DriftState:
-    """The last tips' signed distances from their epipolar lines, px, the newest last: a value, as a track is.
-
-    has_moved: whether they lie off their lines, to one side, by more than chance and tips allow. Once they do it takes
-    half of what is tolerated to say that they do no more: an alarm that comes and goes with the noise helps nobody.
-    """
-
-    offsets_px: tuple[float, ...] = ()
-    has_moved: bool = False
-
-    def after(self, track: NeedleTrack, rig: StereoRig, parameters: DriftParameters) -> "DriftState":
-        """The state with one more track; one without a tip in both views adds nothing."""
-        tip_px = track.evidence.tip_px
-        if tip_px is None or track.status is Status.INVALID:
-            return self
-        left, right = rig.left.undistort(tip_px[[0]]), rig.right.undistort(tip_px[[1]])
-        offset = float(epipolar_distance_px(rig.fundamental, left, right)[0])
-        offsets = (*self.offsets_px, offset)[-parameters.window_pairs :]
-        return DriftState(offsets, _moved(np.array(offsets), parameters, already=self.has_moved))
-
-
-def _moved(offsets_px: Float, parameters: DriftParameters, *, already: bool) -> bool:
-    if len(offsets_px) < parameters.least_pairs:
-        return False
-    median = float(np.median(offsets_px))
-    if already:
-        return abs(median) > parameters.max_offset_px / 2
-    spread = _MAD_SIGMA * float(np.median(np.abs(offsets_px - median)))
-    error = float(_MEDIAN_ERROR * spread / np.sqrt(len(offsets_px)))
-    return abs(median) > max(parameters.max_offset_px, parameters.clear_sigmas * error)
-
-
-def doubted(track: NeedleTrack) -> NeedleTrack:
-    """The track, not ok because the cameras have moved; one without a shape stays as it is."""
-    if track.status is Status.INVALID:
-        return track
-    found = {*track.reasons, Reason.CALIBRATION_DRIFT}
-    return replace(track, status=Status.DEGRADED, reasons=tuple(reason for reason in Reason if reason in found))
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,7 +37,7 @@ class Motion:
 
     def applied_to(self, rig: StereoRig) -> StereoRig:
         """The rig after the motion."""
-        turn = Rotation.from_rotvec(np.radians(self.turn_deg)).as_matrix()
+        turn = turned_by(np.radians(self.turn_deg))
         pose = rig.right_from_left
         moved = RigidTransform(turn @ pose.rotation, turn @ pose.translation_mm - self.shift_mm)
         return StereoRig(rig.left, rig.right, moved)
@@ -194,7 +129,7 @@ def _motion(rig: StereoRig, free: Refit) -> tuple[Motion, Motion]:
     """How the right camera moved, and the standard deviations."""
     turn, shift = free.bump[:3], free.bump[3:]
     before_mm = rig.right_from_left.translation_mm
-    moved_mm = Rotation.from_rotvec(turn).as_matrix() @ before_mm - (before_mm + shift)
+    moved_mm = turned_by(turn) @ before_mm - (before_mm + shift)
     by_bump = np.column_stack([-cross_matrix(before_mm), -np.eye(3)])
     sigma_mm = np.sqrt(np.diag(by_bump @ free.bump_covariance @ by_bump.T))
     sigma_deg = np.degrees(np.sqrt(np.diag(free.bump_covariance)[:3]))

@@ -8,7 +8,7 @@ from needletrack.calibration.board import Board
 from needletrack.capture.kernel import Kernel
 from needletrack.capture.source import FrameSource
 from needletrack.config import Config
-from needletrack.daemon.record import both_cameras
+from needletrack.daemon.cameras import both_cameras
 from needletrack.errors import CaptureError
 from needletrack.guidance import Guidance, collect
 from needletrack.recording.board import BoardRecorder

@@ -6,6 +6,7 @@ import threading
 import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from needletrack.config import DEFAULT_NEEDLE, Config, ControlConfig
 from needletrack.errors import ConfigError, RecordingError
@@ -22,12 +23,14 @@ from needletrack.publish.control import (
     StopRecordingRequest,
 )
 from needletrack.publish.message import TrackMessage
-from needletrack.recording.mcap_file import About
-from needletrack.recording.recorder import Recorder
 from needletrack.recording.snapshot import write_snapshot
 from needletrack.records import NeedleTrack, StereoPair
 from needletrack.rig import Rig
 from needletrack.service import Service, Tracker
+
+if TYPE_CHECKING:
+    from needletrack.recording.mcap_file import About
+    from needletrack.recording.recorder import Recorder
 
 _PAIR_WITHIN_S = 2.0
 _FILE_BEGUN_WITHIN_S = 1.0
@@ -71,10 +74,10 @@ class Operator:
         rig: Rig,
         config: Config,
         service: Service,
-        recorder: Recorder | None,
+        recorder: "Recorder | None",
         *,
         tracker_of: Callable[[Config], Tracker],
-        about: Callable[[Config], About],
+        about: "Callable[[Config], About]",
     ) -> None:
         self._rig, self._config, self._service, self._recorder = rig, config, service, recorder
         self._tracker_of, self._about = tracker_of, about
@@ -167,7 +170,7 @@ class Operator:
                 ) from error
         return {"changed": True, "needle": request.needle, "config_digest": config.digest, "after_sequence": after}
 
-    def _required_recorder(self) -> Recorder:
+    def _required_recorder(self) -> "Recorder":
         if self._recorder is None:
             raise ControlRefused(
                 ControlCode.NOT_CONFIGURED, "recording.folder is not set in the daemon's configuration"

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from needletrack.capture.kernel import Kernel
-from needletrack.capture.live import LiveSource
 from needletrack.capture.pairing import SkewReport
 from needletrack.config import Config
+from needletrack.daemon.cameras import both_cameras
 from needletrack.daemon.process import schedule_thread
 from needletrack.recording.mcap_file import UNCALIBRATED, About
 from needletrack.recording.recorder import Recorder, RecorderSettings
@@ -26,13 +26,6 @@ class RecordSummary:
     duration_s: float
     megabytes: float
     skew: SkewReport
-
-
-def both_cameras(config: Config, kernel: Kernel | None = None) -> LiveSource:
-    """Both cameras as configured; kernel: where they are (None: this machine's)."""
-    return LiveSource(
-        config.cameras, tolerance_us=config.pairing.tolerance_us, offset_us=config.pairing.offset_us, kernel=kernel
-    )
 
 
 def record(

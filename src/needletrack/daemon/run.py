@@ -8,6 +8,8 @@ from contextlib import ExitStack
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from enum import IntEnum
+from pathlib import Path
+from typing import TYPE_CHECKING
 
 from needletrack.auditing import AuditedTracker
 from needletrack.capture.kernel import Kernel
@@ -15,11 +17,11 @@ from needletrack.capture.live import LiveSource
 from needletrack.capture.pairing import SkewReport
 from needletrack.capture.source import FrameSource
 from needletrack.config import Config
+from needletrack.daemon.cameras import both_cameras
 from needletrack.daemon.control import Operator, authority
 from needletrack.daemon.metrics import Metrics
 from needletrack.daemon.overlay import Overlays
 from needletrack.daemon.process import AlreadyRunning, OnlyInstance, lock_memory, schedule_thread, settle_memory
-from needletrack.daemon.record import both_cameras
 from needletrack.daemon.systemd import Notifier
 from needletrack.errors import CaptureError, ConfigError
 from needletrack.publish.control import ControlCode, ControlDesk, ControlRefused
@@ -29,11 +31,13 @@ from needletrack.publish.overlay import OverlayPublisher
 from needletrack.publish.publisher import ZenohPublisher
 from needletrack.publish.session import open_endpoints
 from needletrack.publish.tls import TlsFiles
-from needletrack.recording.mcap_file import About
-from needletrack.recording.recorder import Recorder, RecorderSettings
 from needletrack.records import DropReason, NeedleTrack, StereoPair
 from needletrack.rig import Rig
 from needletrack.service import RunSummary, Service, Sink, Surroundings
+
+if TYPE_CHECKING:
+    from needletrack.recording.mcap_file import About
+    from needletrack.recording.recorder import Recorder
 
 _log = logging.getLogger(__name__)
 
@@ -59,7 +63,7 @@ class ExitCode(IntEnum):
 class RecordedSource:
     """A source whose every pair is offered to a recorder before it goes on."""
 
-    def __init__(self, source: FrameSource, recorder: Recorder) -> None:
+    def __init__(self, source: FrameSource, recorder: "Recorder") -> None:
         self._source, self._recorder = source, recorder
 
     @property
@@ -115,13 +119,7 @@ class Daemon:
             opened.callback(notifier.close)
             source: FrameSource = self._cameras
             if config.recording.folder is not None:
-                self._recorder = Recorder(
-                    _recorder_settings(config),
-                    self._about(config),
-                    config.cameras.size_px,
-                    bits=config.cameras.recorded_bits,
-                    begun=config.recording.at_start,
-                )
+                self._recorder = self._new_recorder(config.recording.folder)
                 opened.callback(self._recorder.close, _RECORDER_ENDS_WITHIN_S)
                 source = RecordedSource(source, self._recorder)
             trackers = _Trackers(rig)
@@ -221,7 +219,27 @@ class Daemon:
         pictures = OverlayPublisher(publisher.keys, listen=settings.listen, connect=settings.connect, tls=tls)
         return Overlays(pictures, self.rig, settings.rate_hz, settings.jpeg_quality)
 
-    def _about(self, config: Config) -> About:
+    def _new_recorder(self, folder: Path) -> "Recorder":
+        # MCAP and ROS take 0.1 s to load, for which a daemon that records nothing does not wait.
+        from needletrack.recording.recorder import Recorder, RecorderSettings
+
+        settings = self.config.recording
+        return Recorder(
+            RecorderSettings(
+                folder,
+                buffer_mb=settings.buffer_mb,
+                min_free_mb=settings.min_free_mb,
+                max_file_mb=settings.max_file_mb,
+            ),
+            self._about(self.config),
+            self.config.cameras.size_px,
+            bits=self.config.cameras.recorded_bits,
+            begun=settings.at_start,
+        )
+
+    def _about(self, config: Config) -> "About":
+        from needletrack.recording.mcap_file import About  # the recorder has it already
+
         return About(self.rig, self.rig.name, self.context.run_id, config.model_dump_json())
 
     def _in_thread(self, name: str) -> None:
@@ -330,14 +348,3 @@ def listened_on(config: Config) -> tuple[str, ...]:
     """All endpoints at which the daemon listens, as configured."""
     settings = config.publishing
     return (*settings.listen, *(settings.overlay.listen if settings.overlay.rate_hz > 0 else ()))
-
-
-def _recorder_settings(config: Config) -> RecorderSettings:
-    settings = config.recording
-    assert settings.folder is not None
-    return RecorderSettings(
-        settings.folder,
-        buffer_mb=settings.buffer_mb,
-        min_free_mb=settings.min_free_mb,
-        max_file_mb=settings.max_file_mb,
-    )

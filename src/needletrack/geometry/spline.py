@@ -119,3 +119,26 @@ def curvature(first: npt.ArrayLike, second: npt.ArrayLike) -> Float:
     """Curvature (N,) from first and second derivatives (N, 3) with respect to any parameter: |r' x r''| / |r'|^3."""
     a, b = np.asarray(first, dtype=np.float64), np.asarray(second, dtype=np.float64)
     return np.asarray(np.linalg.norm(np.cross(a, b), axis=1) / np.linalg.norm(a, axis=1) ** 3)
+
+
+def cubic_interpolation(values: int, finer: int) -> Float:
+    """Weights (F, values) of evenly spaced values in a cubic spline through them, read `finer` times to each step.
+
+    Two pieces at either end are one cubic ("not a knot", de Boor 1978): SciPy's CubicSpline, without the 0.2 s that
+    its optimizers take to load. Raises ValueError below four values.
+    """
+    if values < 4:
+        raise ValueError(f"a cubic spline goes through at least 4 values, not {values}")
+    # Second derivatives, times the square of a step: their change is even within either two pieces at the ends.
+    differences, held = np.zeros((values, values)), np.zeros((values, values))
+    inner = np.arange(1, values - 1)
+    for off, weight, share in ((-1, 6, 1), (0, -12, 4), (1, 6, 1)):
+        differences[inner, inner + off], held[inner, inner + off] = weight, share
+    held[0, :3] = held[-1, -3:] = 1, -2, 1
+    bent = np.linalg.solve(held, differences)
+    at = np.arange(finer * (values - 1) + 1)
+    piece = np.minimum(at // finer, values - 2)
+    after = (at / finer - piece)[:, None]
+    before, each = 1 - after, np.eye(values)
+    straight = before * each[piece] + after * each[piece + 1]
+    return np.asarray(straight + ((before**3 - before) * bent[piece] + (after**3 - after) * bent[piece + 1]) / 6)

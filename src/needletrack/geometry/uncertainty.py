@@ -12,11 +12,10 @@ from functools import cached_property
 import cv2
 import numpy as np
 import numpy.typing as npt
-from scipy.spatial.transform import Rotation
 
 from needletrack.geometry.camera import Camera
 from needletrack.geometry.stereo import StereoRig
-from needletrack.geometry.transform import RigidTransform
+from needletrack.geometry.transform import RigidTransform, turned_by
 from needletrack.records import Float, frozen_array
 
 
@@ -66,7 +65,7 @@ def perturbed(rig: StereoRig, change: npt.ArrayLike) -> StereoRig:
     delta = np.asarray(change, dtype=np.float64)
     at = 4 + len(rig.left.distortion)
     turn, shift = delta[-6:-3], delta[-3:]
-    moved = RigidTransform(Rotation.from_rotvec(turn).as_matrix(), shift)
+    moved = RigidTransform(turned_by(turn), shift)
     pose = rig.right_from_left
     rotation = moved.rotation @ pose.rotation
     return StereoRig(

@@ -44,59 +44,51 @@ EXPORT void products(const double *sections, int64_t n, int64_t count, const dou
   }
 }
 
-/* The weights (n, f) of `products` in the log evidence of n covariances (n, count, count) of what is seen but for the
-   noise: -1/2 x' C^-1 x - 1/2 log det C of sections x whitened by `whitener`. Symmetric matrices; by Cholesky. */
-EXPORT void evidence_weights(const double *covariances, int64_t n, int64_t count, const double *whitener, float *out) {
-  double white[MOST_SAMPLES * MOST_SAMPLES], half[MOST_SAMPLES * MOST_SAMPLES], inverse[MOST_SAMPLES * MOST_SAMPLES];
-  for (int64_t each = 0; each < n; each++) {
-    const double *seen = covariances + each * count * count;
-    /* half = whitener (C + 1), white = the lower triangle of half whitener. */
-    for (int64_t i = 0; i < count; i++) {
-      double *row = half + i * count;
-      for (int64_t j = 0; j < count; j++) row[j] = whitener[i * count + j];
-      for (int64_t k = 0; k < count; k++) {
-        double factor = whitener[i * count + k];
-        for (int64_t j = 0; j < count; j++) row[j] += factor * seen[k * count + j];
-      }
-    }
-    for (int64_t i = 0; i < count; i++)
-      for (int64_t j = 0; j <= i; j++) {
-        double sum = 0;
-        for (int64_t k = 0; k < count; k++) sum += half[i * count + k] * whitener[j * count + k];
-        white[i * count + j] = sum;
-      }
+/* Columns of a bank of p shifts: eight of them before one kind of background, the same before the other, the next. */
+int64_t columns_of(int64_t p) { return (p + 7) / 8 * 16; }
+
+/* A bank of covariances (2, places, count, count) of what is seen but for the noise, before one kind of background and
+   before the other: the weights of `products` in the log evidence -1/2 x' C^-1 x - 1/2 log det C of sections x.
+
+   unwhitened (count, count): rows of the inverse of what `products` whitens by. C = R' R by Cholesky; with M the solution
+   of R' M = unwhitened the inverse, whitened, is M' M. out: panels as `both_ways` reads them, filled up with zeros. */
+EXPORT void evidence_bank(const double *covariances, int64_t places, int64_t count, const double *unwhitened,
+                          float *out) {
+  double root[MOST_SAMPLES * MOST_SAMPLES], solved[MOST_SAMPLES * MOST_SAMPLES], inverse[MOST_SAMPLES * MOST_SAMPLES];
+  const int64_t even = even_samples(count), of_even = even_features(count), of_odd = features(count) - of_even;
+  const size_t square = sizeof(double) * (size_t)(count * count);
+  float *odd = out + columns_of(places) * of_even;
+  memset(out, 0, sizeof(float) * (size_t)(columns_of(places) * features(count)));
+  for (int64_t each = 0; each < 2 * places; each++) {
+    memcpy(root, covariances + each * count * count, square);
+    memcpy(solved, unwhitened, square);
+    memset(inverse, 0, square);
     double log_determinant = 0;
-    for (int64_t i = 0; i < count; i++)
-      for (int64_t j = 0; j <= i; j++) {
-        double sum = white[i * count + j];
-        for (int64_t k = 0; k < j; k++) sum -= white[i * count + k] * white[j * count + k];
-        white[i * count + j] = i == j ? sqrt(sum) : sum / white[j * count + j];
+    for (int64_t k = 0; k < count; k++) {
+      double *row = root + k * count, *there = solved + k * count;
+      double pivot = sqrt(row[k] + 1), scale = 1 / pivot;
+      log_determinant += log(pivot);
+      for (int64_t j = k + 1; j < count; j++) row[j] *= scale;
+      for (int64_t j = 0; j < count; j++) there[j] *= scale;
+      for (int64_t i = k + 1; i < count; i++) {
+        double factor = row[i], *below = root + i * count, *next = solved + i * count;
+        for (int64_t j = i; j < count; j++) below[j] -= factor * row[j];
+        for (int64_t j = 0; j < count; j++) next[j] -= factor * there[j];
       }
-    for (int64_t i = 0; i < count; i++) log_determinant += log(white[i * count + i]);
-    /* half = the inverse of the root, row by row; inverse = half' half, its upper triangle. */
-    for (int64_t i = 0; i < count; i++) {
-      double *row = half + i * count, scale = 1 / white[i * count + i];
-      for (int64_t j = 0; j < count; j++) row[j] = i == j;
-      for (int64_t k = 0; k < i; k++) {
-        double factor = white[i * count + k];
-        for (int64_t j = 0; j <= k; j++) row[j] -= factor * half[k * count + j];
+      for (int64_t i = 0; i < count; i++) {
+        double factor = there[i], *sum = inverse + i * count;
+        for (int64_t j = i; j < count; j++) sum[j] += factor * there[j];
       }
-      for (int64_t j = 0; j <= i; j++) row[j] *= scale;
     }
-    memset(inverse, 0, sizeof(double) * (size_t)(count * count));
-    for (int64_t k = 0; k < count; k++)
-      for (int64_t i = 0; i <= k; i++) {
-        double factor = half[k * count + i];
-        for (int64_t j = i; j <= k; j++) inverse[i * count + j] += factor * half[k * count + j];
-      }
-    int64_t even = even_samples(count);
-    float *at = out + each * features(count);
+    int64_t place = each % places, column = each / places * 8 + place % 8;
+    float *at = out + place / 8 * 16 * of_even + column;
     for (int64_t i = 0; i < count; i++)
-      for (int64_t j = i, last = i < even ? even : count; j < last; j++)
-        *at++ = (float)(i == j ? -0.5 * inverse[i * count + i] : -inverse[i * count + j]);
-    *at++ = (float)-log_determinant;
+      for (int64_t j = i, last = i < even ? even : count; j < last; j++, at += 16)
+        *at = (float)((i == j ? -0.5 : -1) * inverse[i * count + j]);
+    *at = (float)-log_determinant;
+    at = odd + place / 8 * 16 * of_odd + column;
     for (int64_t i = 0; i < even; i++)
-      for (int64_t j = even; j < count; j++) *at++ = (float)-inverse[i * count + j];
+      for (int64_t j = even; j < count; j++, at += 16) *at = (float)-inverse[i * count + j];
   }
 }
 
@@ -150,9 +142,6 @@ static void multiply(const float *a, int64_t n, int64_t stride, int64_t k, const
     }
   }
 }
-
-/* Columns of a bank of p shifts: eight of them before one kind of background, the same before the other, the next. */
-int64_t columns_of(int64_t p) { return (p + 7) / 8 * 16; }
 
 /* Log evidence (n, c) of what the first c columns of a bank hold, and of its mirror images, for `products` (n, f) of
    sections of `count`.

@@ -2,10 +2,7 @@
 
 from dataclasses import replace
 
-import numpy as np
-from scipy.spatial.transform import Rotation
-
-from needletrack.geometry.transform import RigidTransform
+from needletrack.geometry.transform import RigidTransform, turned_orientation
 from needletrack.records import NeedleTrack, TipPose
 from needletrack.rig import Registration
 
@@ -29,12 +26,11 @@ def in_published_frame(track: NeedleTrack, registration: Registration | None) ->
 
 def _moved_tip(tip: TipPose, robot_from_rig: RigidTransform) -> TipPose:
     turn = robot_from_rig.rotation
-    orientation = Rotation.from_matrix(turn) * Rotation.from_quat(tip.orientation_xyzw)
     return replace(
         tip,
         position_mm=robot_from_rig.apply(tip.position_mm),
         direction=turn @ tip.direction,
-        orientation_xyzw=np.asarray(orientation.as_quat()),
+        orientation_xyzw=turned_orientation(turn, tip.orientation_xyzw),
         covariance_mm2=turn @ tip.covariance_mm2 @ turn.T,
         velocity_mm_s=None if tip.velocity_mm_s is None else turn @ tip.velocity_mm_s,
     )

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from needletrack.errors import PublishError
 
 DEFAULT_PREFIX = "needletrack"
+DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
 TRACK_ENCODING = "application/json;needletrack.track.v1"
 STATUS_ENCODING = "application/json;needletrack.status.v1"
 OVERLAY_ENCODING = "image/jpeg"

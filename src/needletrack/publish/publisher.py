@@ -12,9 +12,9 @@ import zenoh
 
 from needletrack.errors import PublishError
 from needletrack.publish.clock import CLOCK_ENCODING, ClockMessage
-from needletrack.publish.keys import DEFAULT_PREFIX, STATUS_ENCODING, TRACK_ENCODING, RigKeys
+from needletrack.publish.keys import DEFAULT_ENDPOINT, DEFAULT_PREFIX, STATUS_ENCODING, TRACK_ENCODING, RigKeys
 from needletrack.publish.message import RunContext, StatusMessage, TrackMessage
-from needletrack.publish.session import DEFAULT_ENDPOINT, close_soon, direct, open_session
+from needletrack.publish.session import close_soon, direct, open_session
 from needletrack.publish.tls import TlsFiles
 
 DEFAULT_HEARTBEAT_S = 0.5

@@ -22,8 +22,6 @@ T = TypeVar("T")
 
 _log = logging.getLogger(__name__)
 
-DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
-
 # A hung peer is noticed after three quarters of the lease (0.75 s); Zenoh's own default is 10 s.
 LEASE_MS = 1000
 RECONNECT_MS = (100, 1000)

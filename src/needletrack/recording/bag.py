@@ -5,6 +5,7 @@ import weakref
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from threading import Lock
 from types import SimpleNamespace
@@ -21,6 +22,7 @@ from rosbags.interfaces import Connection
 from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as BagWriter
 from rosbags.typesys import Stores, get_typestore
+from rosbags.typesys.store import Typestore
 
 from needletrack.errors import CalibrationError, NeedletrackError, RecordingError
 from needletrack.reading import opened, picture, text_of, yaml_document
@@ -40,7 +42,7 @@ from needletrack.recording.mcap_file import (
 )
 from needletrack.recording.pairing import in_order, pair_by_stamp
 from needletrack.recording.png import as_gray
-from needletrack.recording.replay import StoredRecording
+from needletrack.recording.replay import Copied, StoredRecording
 from needletrack.records import Clock, DropReason, Frame, Pixels, StereoPair
 from needletrack.rig import Rig
 
@@ -178,10 +180,12 @@ class BagRecording:
         # By ROS's own definition of the type, not by the one in the bag, which may call a stamp's seconds a text.
         if self._reader.is2:
             return typestore().deserialize_cdr(raw, connection.msgtype)
-        return _ROS1.deserialize_ros1(raw, connection.msgtype)
+        return _ros1().deserialize_ros1(raw, connection.msgtype)
 
 
-_ROS1 = get_typestore(Stores.ROS1_NOETIC)
+@cache
+def _ros1() -> Typestore:
+    return get_typestore(Stores.ROS1_NOETIC)
 
 
 def _stamp_ns(message: Any) -> int:
@@ -203,15 +207,6 @@ def _refused(path: Path) -> Iterator[None]:
 def is_bag(path: Path) -> bool:
     """Whether a path looks like a ROS bag: a ROS 1 file, a ROS 2 folder or file."""
     return path.suffix in (".bag", ".db3", ".mcap") or (path / _METADATA).is_file()
-
-
-@dataclass(frozen=True, slots=True)
-class Copied:
-    """What was written: where, pairs, and a sentence for each pair that could not be read."""
-
-    path: Path
-    pairs: int
-    left_out: tuple[str, ...]
 
 
 def write_recording(

@@ -17,6 +17,15 @@ from needletrack.rig import Rig
 _log = logging.getLogger(__name__)
 
 
+@dataclass(frozen=True, slots=True)
+class Copied:
+    """What was written: where, pairs, and a sentence for each pair that could not be read."""
+
+    path: Path
+    pairs: int
+    left_out: tuple[str, ...]
+
+
 class StoredRecording(Protocol):
     """What every kind of recording offers: its pairs in the order of their stamps, read one at a time."""
 

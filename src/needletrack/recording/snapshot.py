@@ -10,7 +10,7 @@ from pathlib import Path
 from needletrack.errors import RecordingError
 from needletrack.publish.message import TrackMessage
 from needletrack.recording.asl import ListedPair, Loss
-from needletrack.recording.stored import write_asl
+from needletrack.recording.asl_writer import write_asl
 from needletrack.records import StereoPair
 from needletrack.rig import Rig
 

@@ -12,9 +12,9 @@ from functools import cache, cached_property, lru_cache
 
 import numpy as np
 import numpy.typing as npt
-from scipy.interpolate import CubicSpline
 from scipy.special import ndtr
 
+from needletrack.geometry.spline import cubic_interpolation
 from needletrack.kernels import address, call
 from needletrack.records import Appearance, Float
 
@@ -26,6 +26,8 @@ Mask = npt.NDArray[np.bool_]
 REACH, ACROSS_STEP = 8.0, 0.5
 UNITS_PER_MAX_DIAMETER = 6.0
 OFFSETS = np.arange(-REACH, REACH + ACROSS_STEP / 2, ACROSS_STEP)
+# Fine shifts to each shift.
+_FINER = 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,12 +49,12 @@ class Grid:
     @cached_property
     def fine_shifts(self) -> Float:
         """Four (F,) to each of them."""
-        return np.linspace(self.shifts[0], self.shifts[-1], 4 * (len(self.shifts) - 1) + 1)
+        return np.linspace(self.shifts[0], self.shifts[-1], _FINER * (len(self.shifts) - 1) + 1)
 
     @cached_property
     def refine(self) -> Float32:
         """Cubic interpolation (F, S)."""
-        return np.asarray(CubicSpline(self.shifts, np.eye(len(self.shifts)))(self.fine_shifts), dtype=np.float32)
+        return cubic_interpolation(len(self.shifts), _FINER).astype(np.float32)
 
 
 # Where the axis is nearly known; where it is not; and where it has to be found and known at one look.
@@ -66,6 +68,7 @@ HALF_WIDTHS = 1.2 * 1.04 ** np.arange(0, 34)
 # (shaded, streaks, anything).
 _LEVEL, _SIDE = 200.0, 20.0
 _BACKGROUND_WANDER = (2.0, 12.0)
+_KINDS = np.array(_BACKGROUND_WANDER)[:, None, None] ** 2
 INSIDES = ((20.0, 60.0), (150.0, 100.0))
 DULL, LIVELY = 0, 1
 # Two sides that meet, with next to nothing in between, are one edge.
@@ -146,7 +149,7 @@ EDGES = _EVEN - 2
 def reference() -> Float:
     """What whitens background that wanders least, and leaves even samples, then odd ones (n, n) of a section (n,)."""
     n = len(OFFSETS)
-    covariance = _covariances(OFFSETS[None], 0.0, BLURS[0], 0)[0, 0] + np.eye(n)
+    covariance = _background(OFFSETS[None], BLURS[0])[0, 0] + np.eye(n)
     values, vectors = np.linalg.eigh((covariance + covariance[::-1, ::-1]) / 2)
     white = (vectors / np.sqrt(values)) @ vectors.T
     even = (white + white[::-1])[:_EVEN] / np.sqrt(2)
@@ -182,29 +185,26 @@ def banks(grid: Grid) -> Banks:
 
 
 def new_bank(half_width: float, blur: float, inside: int, grid: Grid) -> Float32:
-    """The hypotheses of one half width at every shift of the grid; of 0: of background alone, without shifts.
+    """The hypotheses of one half width at every shift of the grid.
 
     They are the weights of `products` in the log evidence of each kind and of shifts from 0 on, as `_as_bank` lays
     them out; shifts the other way are the mirror images.
     """
-    extra = grid.reach // grid.substeps + 1
-    n = len(OFFSETS)
-    longer = np.arange(-extra, n) * ACROSS_STEP - REACH
-    rests = np.arange(grid.substeps)[:, None] * (ACROSS_STEP / grid.substeps)
-    seen = _covariances(longer - rests, half_width, blur, inside)
+    extra, n = _beyond(grid), len(OFFSETS)
+    seen = _covariances(_seen_at_shifts(half_width, blur, grid), inside)
     covariances = np.empty((seen.shape[1], grid.reach + 1, n, n))
     for shift in range(grid.reach + 1):
         whole, rest = divmod(shift, grid.substeps)
         covariances[:, shift] = seen[rest, :, extra - whole : extra - whole + n, extra - whole : extra - whole + n]
-    return _as_bank(_weights(covariances))
+    return _as_bank(covariances)
 
 
 @cache
 def no_needle_bank(blur: float) -> Float32:
     """A single edge at every sample from the middle on but the outermost ones, then background alone."""
-    alone = _covariances(OFFSETS[None], 0.0, blur, 0)
-    edges = _covariances(OFFSETS - np.arange(EDGES)[:, None] * ACROSS_STEP, _EDGE_HALF_WIDTH, blur, 0)
-    return _as_bank(_weights(np.concatenate([edges, alone]).swapaxes(0, 1)))
+    edges = _seen(OFFSETS - np.arange(EDGES)[:, None] * ACROSS_STEP, _EDGE_HALF_WIDTH, blur)
+    covariances = [_covariances(edges, DULL), _background(OFFSETS[None], blur)]
+    return _as_bank(np.concatenate(covariances).swapaxes(0, 1))
 
 
 @cache
@@ -218,49 +218,75 @@ def _columns_of(places: int) -> int:
     return -(-places // 8) * 16
 
 
-def _as_bank(weights: Float32) -> Float32:
-    """Weights (kinds, places, F) as kernels multiply by them: panels of sixteen columns, of even products, then of odd.
+def _as_bank(covariances: Float) -> Float32:
+    """What kernels multiply by, of covariances (kinds, places, n, n) of what is seen but for noise.
 
-    A panel holds eight places before one kind of background and before the other, so that the places in the middle can
-    be asked alone.
+    The weights of `products` in log evidence, in panels of sixteen columns: of even products, then of odd. A panel
+    holds eight places before one kind of background and before the other, so that the places in the middle can be asked
+    alone.
     """
-    kinds, places, _ = weights.shape
-    columns = np.zeros((_columns_of(places) // 16, _FEATURES, kinds, 8), np.float32)
-    for place in range(places):
-        columns[place // 8, :, :, place % 8] = weights[:, place].T
-    return np.concatenate([columns[:, :_EVEN_FEATURES].ravel(), columns[:, _EVEN_FEATURES:].ravel()])
-
-
-def _weights(covariances: Float) -> Float32:
-    """The weights (..., F) of `products` in log evidence; covariances (..., n, n) are of what is seen but for noise."""
     contiguous = np.ascontiguousarray(covariances)
-    n = contiguous.shape[-1]
-    weights = np.empty((*contiguous.shape[:-2], _FEATURES), np.float32)
-    call("evidence_weights", contiguous, contiguous.size // n**2, n, reference(), weights)
-    weights[..., _EVEN_FEATURES - 1] += np.linalg.slogdet(reference())[1]
-    return weights
+    places, n = contiguous.shape[1:3]
+    bank = np.empty(_columns_of(places) * _FEATURES, np.float32)
+    call("evidence_bank", contiguous, places, n, _unwhitened(), bank)
+    return bank
 
 
-def _covariances(samples: Float, half_width: float, blur: float, inside: int) -> Float:
-    """Covariances (P, kinds, n, n) of what n samples at each of the places (P, n) from the axis see through the lens.
+@cache
+def _unwhitened() -> Float:
+    return np.ascontiguousarray(np.linalg.inv(reference()))
 
-    One kind for each wander of the background, which is a random walk: the sum of steps at places a bin apart, each of
-    which is seen as the blur's integral.
+
+@dataclass(frozen=True, eq=False)
+class _Seen:
+    """What n samples at each of P places from the axis see of a needle through the lens, but for its inside's look.
+
+    Backgrounds are random walks: sums of steps at places a bin apart, each of which is seen as the blur's integral.
+    walks and sides (P, n, n): covariances of those, and of the level of one side against the other. bins (P, n, B): how
+    much of each bin of the inside a sample sees; between (B,): where they begin.
     """
-    wander = np.array(_BACKGROUND_WANDER)[:, None, None] ** 2
-    if half_width == 0:
-        steps = ndtr((samples[..., None] - np.arange(0.5 - _LATENT_REACH, _LATENT_REACH, _LATENT_STEP)) / blur)
-        return np.asarray(_LEVEL**2 + wander * (_LATENT_STEP * _gram(steps))[:, None])
+
+    walks: Float
+    sides: Float
+    bins: Float
+    between: Float
+
+
+def _seen(samples: Float, half_width: float, blur: float) -> _Seen:
+    """What samples (P, n) see of a needle so wide."""
     steps = ndtr((np.stack([samples, -samples])[..., None] - half_width - _OUTWARDS) / blur)
     sides = _gram(steps[..., :1]).sum(axis=0)
     walks = _LATENT_STEP * (_gram(steps[..., 1:]).sum(axis=0) + sides / 2)
     borders = np.linspace(-half_width, half_width, max(2, round(2 * half_width / _LATENT_STEP)) + 1)
     bins = -np.diff(ndtr((samples[..., None] - borders) / blur), axis=-1)
-    between = borders[:-1]
-    inside_wander, size = INSIDES[inside]
-    decay = np.exp(-np.abs(between[:, None] - between) * inside_wander**2 / (2 * size**2))
-    common = _LEVEL**2 + _SIDE**2 * sides + size**2 * bins @ decay @ bins.swapaxes(-1, -2)
-    return np.asarray(common[:, None] + wander * walks[:, None])
+    return _Seen(walks, sides, bins, borders[:-1])
+
+
+def _beyond(grid: Grid) -> int:
+    """So many samples more than a section has hold what it sees at every shift by whole samples."""
+    return grid.reach // grid.substeps + 1
+
+
+# One after another, banks of either inside are made of it.
+@lru_cache(maxsize=2)
+def _seen_at_shifts(half_width: float, blur: float, grid: Grid) -> _Seen:
+    longer = np.arange(-_beyond(grid), len(OFFSETS)) * ACROSS_STEP - REACH
+    rests = np.arange(grid.substeps)[:, None] * (ACROSS_STEP / grid.substeps)
+    return _seen(longer - rests, half_width, blur)
+
+
+def _covariances(seen: _Seen, inside: int) -> Float:
+    """Covariances (P, kinds, n, n) of what is seen of a needle: a kind for each wander of the background."""
+    wander, size = INSIDES[inside]
+    decay = np.exp(-np.abs(seen.between[:, None] - seen.between) * wander**2 / (2 * size**2))
+    common = _LEVEL**2 + _SIDE**2 * seen.sides + size**2 * seen.bins @ decay @ seen.bins.swapaxes(-1, -2)
+    return np.asarray(common[:, None] + _KINDS * seen.walks[:, None])
+
+
+def _background(samples: Float, blur: float) -> Float:
+    """Covariances (P, kinds, n, n) of what samples (P, n) see of background alone."""
+    steps = ndtr((samples[..., None] - np.arange(0.5 - _LATENT_REACH, _LATENT_REACH, _LATENT_STEP)) / blur)
+    return np.asarray(_LEVEL**2 + _KINDS * (_LATENT_STEP * _gram(steps))[:, None])
 
 
 def _gram(rows: Float) -> Float:

@@ -181,7 +181,7 @@ def _looks(needle: Needle, px_per_unit: float) -> tuple[list[int], list[int]]:
 
 
 def make_banks(needle: Needle, px_per_unit: float) -> None:
-    """Make what every look of a needle is tried with: a third of a second, which no pair should wait for."""
+    """Make what every look of a needle is tried with: a fifth of a second, which no pair should wait for."""
     widths, blurs = _looks(needle, px_per_unit)
     no_needle_addresses()
     for blur in blurs:

@@ -51,7 +51,7 @@ enum { LANES = 4 };
    first (2 windows + 1): where the pixels of each flank begin; free: how many of these are not clipped, and come first;
    number: the same without padding. Of each pixel: how far from the curve, px per mm of radius, grey, 1 / sigma. */
 typedef struct {
-  int64_t windows, *window, *first, *free, *number, longest;
+  int64_t windows, *window, *first, *free, *number;
   double *away_px, *scale, *gray, *precise;
   /* Of each flank what is solved for (background, tilt, log brightness); how near its pixels are at least; its sums. */
   double *flank, *nearest_px, *sums;
@@ -225,7 +225,6 @@ static int seen_by(const Rules *r, const Eye *eye, const double *local, double s
     int64_t clipped = (place[2 * f + 1] + LANES - 1) / LANES * LANES;
     place[2 * f] = all, place[2 * f + 1] = all + v->free[f];
     all += v->free[f] + clipped;
-    v->longest = v->free[f] + clipped > v->longest ? v->free[f] + clipped : v->longest;
     v->nearest_px[f] = INFINITY;
   }
   v->first[flanks] = all;
@@ -270,19 +269,19 @@ static const double OVER_ROOT = 0.3989422804014327; /* 1 / sqrt(2 pi) */
 /* An edge so many sigmas away takes 1e-12 of the light, which no grey level shows. */
 #define FAR_SIGMAS 7.0
 
-/* What the pixels of a flank are, as the model has it, and by what: room for the longest of them. */
+/* Pixels of a flank, as the model has them, and by what they change: so many at a time stay in the nearest cache, and
+   arrays of a known place in one structure are known not to overlap: loops over them become vectors. */
+enum { BLOCK = 200 };
 typedef struct {
-  double *level, *slope, *curvature, *doubt;
-  double *by_radius, *by_blur, *by_middle, *tilt, *by_bright;
+  double level[BLOCK], slope[BLOCK], curvature[BLOCK], doubt[BLOCK];
+  double by_radius[BLOCK], by_blur[BLOCK], by_middle[BLOCK], tilt[BLOCK], by_bright[BLOCK];
 } Spread;
 
 /* The level of `count` pixels `away` of the curve, whose edge is `radius_mm` times scale from their middle, and what it
    changes by. The opposite edge is as blurred; `with_far` where it is near enough to count. */
 static inline __attribute__((always_inline)) void levels(const double *restrict away, const double *restrict scale,
                                                          int64_t count, double radius_mm, double blur_px, double shift_px,
-                                                         const double *flank, int with_far, const Spread *s) {
-  double *restrict level = s->level, *restrict by_radius = s->by_radius, *restrict by_blur = s->by_blur;
-  double *restrict by_middle = s->by_middle, *restrict tilt = s->tilt, *restrict by_bright = s->by_bright;
+                                                         const double *flank, int with_far, Spread *restrict s) {
   double over = 1 / blur_px, background = flank[0], slant = flank[1], bright = exp(flank[2]);
   double per_density = bright * OVER_ROOT;
   for (int64_t k = 0; k < count / LANES * LANES; k++) {
@@ -295,41 +294,39 @@ static inline __attribute__((always_inline)) void levels(const double *restrict 
       passed -= far > 0 ? beyond2 : 1 - beyond2;
       sum += density2, moment += density2 * far, difference -= density2;
     }
-    by_radius[k] = per_density * sum * over * scale[k], by_blur[k] = -per_density * moment;
-    by_middle[k] = per_density * difference * over, by_bright[k] = bright * passed;
-    tilt[k] = away[k] - half;
-    level[k] = background + slant * tilt[k] + by_bright[k];
+    s->by_radius[k] = per_density * sum * over * scale[k], s->by_blur[k] = -per_density * moment;
+    s->by_middle[k] = per_density * difference * over, s->by_bright[k] = bright * passed;
+    s->tilt[k] = away[k] - half;
+    s->level[k] = background + slant * (away[k] - half) + bright * passed;
   }
 }
 
 /* Slope and curvature by their level of the negative log likelihood of pixels that have their value; doubt: e to the
    power of how much likelier they might be, over the square of `robust`. */
 static void told_by_free(const double *restrict gray, const double *restrict precise, int64_t count, double robust,
-                         const Spread *s) {
-  double *restrict level = s->level, *restrict slope = s->slope, *restrict curvature = s->curvature;
-  double *restrict doubt = s->doubt, over = 1 / robust;
+                         Spread *restrict s) {
+  double over = 1 / robust;
   for (int64_t k = 0; k < count / LANES * LANES; k++) {
-    double off = (level[k] - gray[k]) * precise[k], share = off * over, weight = 1 / (1 + share * share);
-    doubt[k] = 1 + share * share;
-    slope[k] = weight * off * precise[k], curvature[k] = weight * precise[k] * precise[k];
+    double off = (s->level[k] - gray[k]) * precise[k], share = off * over, weight = 1 / (1 + share * share);
+    s->doubt[k] = 1 + share * share;
+    s->slope[k] = weight * off * precise[k], s->curvature[k] = weight * precise[k] * precise[k];
   }
 }
 
-/* The same of pixels that are at least white. */
+/* The same of pixels from .. to - 1 that are at least white. */
 static void told_by_clipped(const double *restrict precise, int64_t from, int64_t to, double white, double least,
-                            double most, const Spread *s) {
-  double *restrict level = s->level + from, *restrict slope = s->slope + from, *restrict curvature = s->curvature + from;
-  for (int64_t k = 0; k < (to - from) / LANES * LANES; k++) {
-    double above = (level[k] - white) * precise[k];
+                            double most, Spread *restrict s) {
+  for (int64_t k = from; k < to; k++) {
+    double above = (s->level[k] - white) * precise[k];
     above = above < least ? least : above > most ? most : above;
     double t = fabs(above), density = exp_negative_precise(-0.5 * t * t), beyond = density * tail(t);
     double mills = OVER_ROOT * density / (above > 0 ? 1 - beyond : beyond);
-    slope[k] = -mills * precise[k], curvature[k] = mills * (mills + above) * precise[k] * precise[k];
+    s->slope[k] = -mills * precise[k], s->curvature[k] = mills * (mills + above) * precise[k] * precise[k];
   }
 }
 
-/* The upper triangle of the Hessian of a flank, each row with its gradient behind it. */
-static void summed(const Spread *s, int64_t count, double *sums) {
+/* Adds up the upper triangle of the Hessian of a flank, each row with its gradient behind it. */
+static void add_up(const Spread *s, int64_t count, double *sums) {
   const double *restrict r = s->by_radius, *restrict b = s->by_blur, *restrict m = s->by_middle, *restrict t = s->tilt;
   const double *restrict l = s->by_bright, *restrict c = s->curvature, *restrict g = s->slope;
   double rr = 0, rb = 0, rm = 0, r1 = 0, rt = 0, rl = 0, rg = 0, bb = 0, bm = 0, b1 = 0, bt = 0, bl = 0, bg = 0;
@@ -354,30 +351,36 @@ static void summed(const Spread *s, int64_t count, double *sums) {
   }
   double all[SUMS] = {rr, rb, rm, r1, rt, rl, rg, bb, bm, b1, bt, bl, bg, mm,
                       m1, mt, ml, mg, one, t1, l1, g1, tt, tl, tg, ll, lg};
-  memcpy(sums, all, sizeof all);
+  for (int k = 0; k < SUMS; k++) sums[k] += all[k];
 }
 
 /* How far a view is from what the model has it, and how far each window is; not 0 where it is not off anywhere. */
-static int normals(const Rules *r, View *v, double radius_mm, double blur_px, const Spread *s, double *sorted) {
+static int normals(const Rules *r, View *v, double radius_mm, double blur_px, Spread *s, double *sorted) {
+  memset(v->sums, 0, (size_t)(2 * SUMS * v->windows) * sizeof *v->sums);
   for (int64_t w = 0; w < v->windows; w++) {
     double off = 0;
     int64_t number = 0;
     for (int side = 0; side < 2; side++) {
       int64_t f = 2 * w + side, first = v->first[f], count = v->first[f + 1] - first, free = v->free[f];
-      const double *away = v->away_px + first, *scale = v->scale + first, *flank = v->flank + 3 * f;
+      const double *flank = v->flank + 3 * f;
       double shift_px = side ? v->middle[w] : -v->middle[w];
-      if (v->nearest_px[f] - shift_px > FAR_SIGMAS * blur_px)
-        levels(away, scale, count, radius_mm, blur_px, shift_px, flank, 0, s);
-      else
-        levels(away, scale, count, radius_mm, blur_px, shift_px, flank, 1, s);
-      told_by_free(v->gray + first, v->precise + first, free, r->robust, s);
-      told_by_clipped(v->precise + first + free, free, count, r->clipped_gray - 0.5, -r->robust, r->most_above, s);
-      summed(s, count, v->sums + SUMS * f);
-      /* One logarithm of a product, which stays finite, for so many. */
-      for (int64_t from = 0; from < free; from += 16) {
-        double product = 1;
-        for (int64_t k = from; k < from + 16 && k < free; k++) product *= s->doubt[k];
-        off += r->robust * r->robust * log(product);
+      int has_far = v->nearest_px[f] - shift_px < FAR_SIGMAS * blur_px;
+      for (int64_t from = 0; from < count; from += BLOCK) {
+        int64_t here = count - from < BLOCK ? count - from : BLOCK;
+        int64_t valued = free < from ? 0 : free - from < here ? free - from : here;
+        const double *away = v->away_px + first + from, *scale = v->scale + first + from;
+        const double *gray = v->gray + first + from, *precise = v->precise + first + from;
+        if (has_far) levels(away, scale, here, radius_mm, blur_px, shift_px, flank, 1, s);
+        else levels(away, scale, here, radius_mm, blur_px, shift_px, flank, 0, s);
+        told_by_free(gray, precise, valued, r->robust, s);
+        told_by_clipped(precise, valued, here, r->clipped_gray - 0.5, -r->robust, r->most_above, s);
+        add_up(s, here, v->sums + SUMS * f);
+        /* One logarithm of a product, which stays finite, for so many. */
+        for (int64_t k = 0; k < valued; k += 16) {
+          double product = 1;
+          for (int64_t each = k; each < k + 16 && each < valued; each++) product *= s->doubt[each];
+          off += r->robust * r->robust * log(product);
+        }
       }
       number += v->number[f];
     }
@@ -555,14 +558,8 @@ static void sure_of_middles(const Rules *r, const View *v, const double inverse[
 
 /* Radius, both blurs, and the windows' middles: see `clipped.py`. before (3,): diameter and blurs, 0: not known. */
 static int solve(const Rules *r, View *views, double seen_radius_mm, const double *before, Found *found) {
-  int64_t longest = 0, most = 0;
-  for (int v = 0; v < 2; v++) {
-    longest = views[v].longest > longest ? views[v].longest : longest;
-    most = views[v].windows > most ? views[v].windows : most;
-  }
-  Spread s = {TAKE(double, longest), TAKE(double, longest), TAKE(double, longest), TAKE(double, longest),
-              TAKE(double, longest), TAKE(double, longest), TAKE(double, longest), TAKE(double, longest),
-              TAKE(double, longest)};
+  int64_t most = views[0].windows > views[1].windows ? views[0].windows : views[1].windows;
+  Spread *s = TAKE(Spread, 1);
   double *sorted = TAKE(double, most);
   if (!sorted) return NO_MEMORY;
   double px_per_mm = found->px_per_mm, usual = log(r->blur_px), radius_mm, log_blur[2], moved = INFINITY;
@@ -578,7 +575,7 @@ static int solve(const Rules *r, View *views, double seen_radius_mm, const doubl
       View *v = views + k;
       double own[4] = {0}, by[2] = {0};
       if (!v->windows) continue;
-      if (normals(r, v, radius_mm, exp(log_blur[k]), &s, sorted) || band(r, v, own, by)) return NOT_SETTLED;
+      if (normals(r, v, radius_mm, exp(log_blur[k]), s, sorted) || band(r, v, own, by)) return NOT_SETTLED;
       border[0][0] += own[0], border[0][1 + k] += own[1], border[1 + k][0] += own[1], border[1 + k][1 + k] += own[3];
       target[0] += by[0], target[1 + k] += by[1];
     }

@@ -7,6 +7,8 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.ndimage import gaussian_filter1d
+from scipy.special import ndtr
 from tests.tracking.scenes import ARC, RIG, WORLDS, Scene, seen_at
 
 from needletrack.geometry import spline
@@ -14,9 +16,21 @@ from needletrack.records import Appearance
 from needletrack.synthetic.needle import Wave
 from needletrack.synthetic.tube import End
 from needletrack.tracking.adjust import adjust
+from needletrack.tracking.evidence import BLURS, HALF_WIDTHS
 from needletrack.tracking.fit import FitParameters
 from needletrack.tracking.needle import Needle
-from needletrack.tracking.tip import BEFORE_MM, BEYOND_MM, ROW_MM, TRIED_MM, TipFit, TipParameters, find_tip
+from needletrack.tracking.tip import (
+    ACROSS,
+    BEFORE_MM,
+    BEYOND_MM,
+    PICTURE_MM,
+    ROW_MM,
+    TRIED_MM,
+    TipFit,
+    TipParameters,
+    find_tip,
+    inside_pictures,
+)
 
 NEEDLE, PARAMETERS = Needle(), TipParameters()
 
@@ -125,3 +139,24 @@ def test_an_end_in_one_view_alone_has_no_contrast_in_the_other() -> None:
     views = ((drawn.images[0], RIG.left, rows), (longer.images[1], RIG.right, RIG.right_from_left.apply(rows)))
     found = find_tip(views, at_mm, true_mm, appearance, NEEDLE, PARAMETERS)
     assert found.contrast[1] < 8.0 < found.contrast[0]
+
+
+@pytest.mark.parametrize("taper_mm", [0.0, 2.5])
+def test_pictures_of_an_end_are_those_of_scipy(taper_mm: float) -> None:
+    sine, unit_mm, appearance = 0.8, 0.2, Appearance(20, 2, 0)
+    pictures = inside_pictures(taper_mm, appearance, unit_mm, sine, None)
+    half_width, blur = HALF_WIDTHS[20], BLURS[2]
+    before = pictures.before_mm + PICTURE_MM * np.arange(len(pictures.parts))
+    if taper_mm > 0:
+        width = half_width * np.clip(before / taper_mm, 0.0, 1.0)
+    else:
+        past = np.maximum((half_width * unit_mm - before) * sine, 0.0) / (half_width * unit_mm)
+        width = half_width * np.sqrt(np.clip(1 - past**2, 0.0, 1.0))
+    sharp = ndtr((ACROSS + width[:, None]) / blur) - ndtr((ACROSS - width[:, None]) / blur)
+    whole = gaussian_filter1d(sharp, blur * unit_mm / sine / PICTURE_MM, axis=0, mode="nearest")
+    # Parts on the shaft and on the end are all of the needle, and none of it twice.
+    np.testing.assert_allclose(pictures.parts.sum(axis=1), whole, atol=1e-9)
+    half = pictures.parts.shape[1] // 2
+    assert np.abs(pictures.parts[0, :half]).max() < 1e-9
+    assert np.abs(pictures.parts[-1, half:]).max() < 1e-9
+    assert pictures.parts[-1, :half].max() > 0.3

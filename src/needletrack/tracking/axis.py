@@ -9,7 +9,6 @@ import numpy as np
 from needletrack.geometry.stereo import StereoRig
 from needletrack.kernels import Array, address
 from needletrack.records import Image
-from needletrack.tracking.clipped import CLIPPED_GRAY
 from needletrack.tracking.evidence import EDGES, HALF_WIDTHS, OFFSETS, Grid, reference
 from needletrack.tracking.fit import ROBUST_SIGMAS, ROUNDS, FitParameters, priors
 from needletrack.tracking.needle import Needle
@@ -37,6 +36,8 @@ P, I, D = ctypes.c_void_p, ctypes.c_int64, ctypes.c_double
 FOUND, NOT_SEEN, NOT_HELD, NO_MEMORY, OTHERS = range(5)
 # Control points of a spline at most.
 MOST_CONTROL = 30
+# A pixel of so much is clipped: the last value but one may still be rounded noise of a clipped one.
+CLIPPED_GRAY = 254
 
 
 class Eye(ctypes.Structure):

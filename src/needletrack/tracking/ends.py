@@ -125,22 +125,23 @@ def is_crossed(observed: Observed, at_mm: float, arc_mm: Float, parameters: Ends
 
 def _common_step(observed: Observed, spacing_mm: float, parameters: EndsParameters) -> Float:
     """The least of the steps (N,), grey, of both flanks in both views where all are of one sense, else 0."""
-    steps = np.stack([_steps(view.flank_gray, spacing_mm, parameters) for view in observed])
+    steps = _steps(np.stack([view.flank_gray for view in observed]), spacing_mm, parameters)
     same = np.abs(np.sign(steps).sum(axis=1)) == 2
     return np.where(same.all(axis=0), np.abs(steps).min(axis=(0, 1)), 0.0)
 
 
 def _steps(flanks: Float, spacing_mm: float, parameters: EndsParameters) -> Float:
-    """Change (2, N) of each flank's mean grey level from behind a place to ahead of it; zero near the curve's ends."""
+    """Change (2, 2, N) of each flank's mean grey level from behind a place to ahead of it; zero near a curve's ends."""
     length = max(2, round(parameters.sleeve_step_mm / spacing_mm))
     gap = max(1, round(EDGE_GAP_MM / spacing_mm))
-    total = np.cumsum(np.pad(flanks, ((0, 0), (1, 0))), axis=1)
-    n = flanks.shape[1]
+    n = flanks.shape[-1]
+    total = np.zeros((*flanks.shape[:-1], n + 1))
+    np.cumsum(flanks, axis=-1, out=total[..., 1:])
     at = np.arange(n)
     behind = (np.clip(at - gap - length, 0, n), np.clip(at - gap, 0, n))
     ahead = (np.clip(at + gap, 0, n), np.clip(at + gap + length, 0, n))
     counts = [np.maximum(stop - start, 1) for start, stop in (behind, ahead)]
-    means = [(total[:, b] - total[:, a]) / count for (a, b), count in zip((behind, ahead), counts, strict=True)]
+    means = [(total[..., b] - total[..., a]) / count for (a, b), count in zip((behind, ahead), counts, strict=True)]
     enough = (counts[0] >= length // 2) & (counts[1] >= length // 2)
     return np.where(enough, means[1] - means[0], 0.0)
 

@@ -13,8 +13,6 @@ from functools import lru_cache
 import numpy as np
 import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict, Field
-from scipy.ndimage import gaussian_filter1d
-from scipy.special import ndtr
 
 from needletrack.errors import NeedleNotFound
 from needletrack.geometry.camera import Camera
@@ -296,14 +294,11 @@ def inside_pictures(
     if edge is not None:
         along = edge.blur * unit_length_mm / sine / PICTURE_MM
         width = outline(width, (edge.blur, along), half_width)
-    borders = np.linspace(-1, 1, _PARTS + 1)[:, None, None] * width[:, None]
-    passed = ndtr((ACROSS - borders) / blur)
-    parts = passed[:-1] - passed[1:]
-    on_end = (before < (taper_mm or radius_mm))[:, None]
-    parts = np.concatenate([np.where(on_end, 0.0, parts), np.where(on_end, parts, 0.0)])
-    smooth = gaussian_filter1d(parts, along_mm / PICTURE_MM, axis=1, mode="nearest")
-    pictures = np.ascontiguousarray(smooth.swapaxes(0, 1))
-    distances, count, columns = pictures.shape
+    distances, count, columns = len(before), 2 * _PARTS, len(ACROSS)
+    pictures, spare = np.empty((2, distances, count, columns))
+    on_end = int(np.searchsorted(before, taper_mm or radius_mm))
+    rows = along_mm / PICTURE_MM
+    call("end_pictures", width, distances, on_end, ACROSS, columns, _PARTS, blur, rows, pictures, spare)
     own, extent = np.empty((distances, count, count)), np.empty((distances, count, 2), np.uint8)
     call("pictures_of", pictures, distances, count, columns, own, extent)
     return EndPictures(float(before[0]), pictures, own, extent)

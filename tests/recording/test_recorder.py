@@ -114,7 +114,7 @@ def test_after_a_recorder_that_is_killed_another_goes_on_in_a_new_file(
 
         # These are on the disk, as nothing follows at once; those that follow are in an unfinished chunk.
         assert all(recorded() for _ in range(5))
-        wait_for(lambda: file.stat().st_size > 6000)
+        wait_for(lambda: file.exists() and file.stat().st_size > 6000)
         wait_for(lambda: recorded() and recorder.state.kept >= 5)
         kept = recorder.state.kept
         killed(recorder)

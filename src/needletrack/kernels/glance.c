@@ -14,6 +14,10 @@ typedef struct {
   const double *before_mm;
   int64_t before;
   double advance_mm, taper_mm, since_s;
+  /* Whether it is looked for roughly first: with fewer sections, on a coarser grid, without its tip. */
+  int64_t roughly_first;
+  Axis rough;
+  double rough_section_mm;
   /* How the curve is sampled. */
   /* A needle that is white along more than this share of it is another matter. */
   double white_share;
@@ -207,9 +211,15 @@ static double farthest_aside(const double *points, const double *moved, int64_t 
   return sqrt(most);
 }
 
-/* One look. Of a curve that will be looked at again no more is told than its points. */
-static int glanced(const Glance *g, const Eye *eyes, TipView *views, int is_last, Found *o) {
-  /* Where the needle must be now, and beyond. */
+/* Where the needle must be now, and beyond: points (n, 3) of arc lengths (n,), mm before its tip, half widths. */
+typedef struct {
+  int64_t n, before_its_tip;
+  double foreseen_mm;
+  double *points, *arc, *before_tip;
+  int64_t *width;
+} Course;
+
+static int course(const Glance *g, double section_mm, int64_t room, Course *c) {
   int64_t more = (int64_t)rint((g->most_advance_mm + g->beyond_mm) / g->spacing_mm), total = g->before + more;
   double *line = TAKE(double, 3 * total), *line_arc = TAKE(double, total);
   if (!line_arc) return NO_MEMORY;
@@ -218,44 +228,86 @@ static int glanced(const Glance *g, const Eye *eyes, TipView *views, int is_last
   lengths(line, total, line_arc);
   double advance = g->advance_mm;
   advance = advance < -g->most_advance_mm ? -g->most_advance_mm : advance > g->most_advance_mm ? g->most_advance_mm : advance;
-  double foreseen = line_arc[g->before - 1] + advance, stop = foreseen + g->beyond_mm;
-  int64_t n = (int64_t)rint(stop / g->section_mm) + 1;
+  c->foreseen_mm = line_arc[g->before - 1] + advance;
+  double stop = c->foreseen_mm + g->beyond_mm;
+  int64_t n = (int64_t)rint(stop / section_mm) + 1;
   n = n < 8 ? 8 : n;
-  if (n > o->room) return NOT_HELD;
-  double *at = TAKE(double, n), *points = TAKE(double, 3 * n), *arc = TAKE(double, n), *before_tip = TAKE(double, n),
-         *local = TAKE(double, 3 * n), *px = TAKE(double, 2 * n);
-  int64_t *width = TAKE(int64_t, n), curve_count = 0;
-  if (!width) return NO_MEMORY;
+  if (n > room) return NOT_HELD;
+  double *at = TAKE(double, n);
+  c->n = n, c->before_its_tip = 0;
+  c->points = TAKE(double, 3 * n), c->arc = TAKE(double, n), c->before_tip = TAKE(double, n), c->width = TAKE(int64_t, n);
+  if (!c->width) return NO_MEMORY;
   for (int64_t i = 0; i < n; i++) at[i] = stop * (double)i / (double)(n - 1);
-  interpolated(line, line_arc, total, at, n, points);
-  lengths(points, n, arc);
+  interpolated(line, line_arc, total, at, n, c->points);
+  lengths(c->points, n, c->arc);
   for (int64_t i = 0; i < n; i++) {
-    before_tip[i] = foreseen - arc[i];
-    curve_count += before_tip[i] >= 0;
+    c->before_tip[i] = c->foreseen_mm - c->arc[i];
+    c->before_its_tip += c->before_tip[i] >= 0;
   }
-  if (curve_count < 6) return TOO_SHORT;
-  tapered(g, before_tip, n, width);
+  if (c->before_its_tip < 6) return TOO_SHORT;
+  tapered(g, c->before_tip, n, c->width);
+  return FOUND;
+}
 
-  Told told[2];
-  uint8_t *counted = TAKE(uint8_t, n);
+/* What both views tell of it. */
+static int told_of(const Glance *g, const Axis *axis, const Eye *eyes, const Course *c, Told *told) {
+  double *local = TAKE(double, 3 * c->n);
+  uint8_t *counted = TAKE(uint8_t, c->n);
+  if (!counted) return NO_MEMORY;
   for (int v = 0; v < 2; v++) {
     Told *t = told + v;
-    if (room_to_tell(&g->axis, n, t)) return NO_MEMORY;
-    posed(eyes[v].posed, points, n, local);
-    for (int64_t i = 0; i < n; i++)
+    if (room_to_tell(axis, c->n, t)) return NO_MEMORY;
+    posed(eyes[v].posed, c->points, c->n, local);
+    for (int64_t i = 0; i < c->n; i++)
       if (local[3 * i + 2] < g->least_depth_mm) return TOO_NEAR;
-    int failed = cut_across(&g->axis, eyes + v, local, n, t);
+    int failed = cut_across(axis, eyes + v, local, c->n, t);
     if (failed) return failed;
-    for (int64_t i = 0; i < n; i++) counted[i] = width[i] >= 0 && t->inside[i];
-    if (white_share(eyes + v, t->center, n, counted, g->axis.white_gray) >= g->white_share) return CLIPPED;
-    if ((failed = weigh(&g->axis, n, width, MOVED, t))) return failed;
+    for (int64_t i = 0; i < c->n; i++) counted[i] = c->width[i] >= 0 && t->inside[i];
+    if (white_share(eyes + v, t->center, c->n, counted, axis->white_gray) >= g->white_share) return CLIPPED;
+    if ((failed = weigh(axis, c->n, c->width, MOVED, t))) return failed;
   }
+  return FOUND;
+}
+
+/* Where the needle is, roughly: points (count, 3) of it, to where its tip was foreseen. */
+static int roughly(const Glance *g, const Eye *eyes, int64_t room, int64_t *count, double *points) {
+  Course c;
+  Told told[2];
+  Fitting fitting;
+  int failed = course(g, g->rough_section_mm, room, &c);
+  if (!failed) failed = told_of(g, &g->rough, eyes, &c, told);
+  double *moved = TAKE(double, 3 * c.n), *arc = TAKE(double, c.n);
+  if (failed || !arc) return failed ? failed : NO_MEMORY;
+  failed = begin_fitting(&g->rough, &g->spline, eyes, told, c.points, c.arc, c.n, g->since_s, &fitting);
+  if (!failed) failed = settle(&g->rough, &g->spline, eyes, told, &fitting, moved);
+  if (failed) return failed;
+  *count = (int64_t)rint(c.foreseen_mm / g->spacing_mm) + 1;
+  if (*count > room) return NOT_HELD;
+  double *u = TAKE(double, *count), *mixing = TAKE(double, 4 * *count);
+  int64_t *first = TAKE(int64_t, *count);
+  if (!first) return NO_MEMORY;
+  for (int64_t i = 0; i < *count; i++) u[i] = c.foreseen_mm / c.arc[c.n - 1] * (double)i / (double)(*count - 1);
+  basis(u, *count, fitting.m, 0, first, mixing);
+  curve(fitting.control, first, mixing, *count, points);
+  return FOUND;
+}
+
+/* One look. Of a curve that will be looked at again no more is told than its points. */
+static int glanced(const Glance *g, const Eye *eyes, TipView *views, int is_last, Found *o) {
+  Course c;
+  Told told[2];
+  int failed = course(g, g->section_mm, o->room, &c);
+  if (!failed) failed = told_of(g, &g->axis, eyes, &c, told);
+  if (failed) return failed;
+  const int64_t n = c.n, curve_count = c.before_its_tip;
+  const double *points = c.points, *arc = c.arc;
+  double *local = TAKE(double, 3 * n), *px = TAKE(double, 2 * n);
 
   /* One spline for both. */
   Fitting fitting;
   double *moved = TAKE(double, 3 * n), *moved_arc = TAKE(double, n);
   if (!moved_arc) return NO_MEMORY;
-  int failed = begin_fitting(&g->axis, &g->spline, eyes, told, points, arc, n, g->since_s, &fitting);
+  failed = begin_fitting(&g->axis, &g->spline, eyes, told, points, arc, n, g->since_s, &fitting);
   if (!failed && fitting.m > o->most_control) return NO_MEMORY;
   if (!failed) failed = settle(&g->axis, &g->spline, eyes, told, &fitting, moved);
   if (failed) return failed;
@@ -375,6 +427,20 @@ static int settled(const Call *call, int64_t most_looks) {
   lengths(now.before_mm, now.before, arc);
   double most = now.most_advance_mm, advance = now.advance_mm < -most ? -most : now.advance_mm > most ? most : now.advance_mm;
   double foreseen = arc[now.before - 1] + advance + now.foreseen_off_mm;
+  if (now.roughly_first) {
+    size_t mark = taken();
+    double *rough = TAKE(double, 3 * o->room);
+    int64_t count;
+    if (!rough) return NO_MEMORY;
+    int answer = roughly(&now, call->eyes, o->room, &count, rough);
+    if (answer == NO_MEMORY) return answer;
+    if (answer == FOUND) {
+      memcpy(line, rough, (size_t)(3 * count) * sizeof *line);
+      lengths(line, count, arc);
+      now.before_mm = line, now.before = count, now.advance_mm = 0, now.foreseen_off_mm = foreseen - arc[count - 1];
+    }
+    give_back(mark);
+  }
   for (int64_t look = 1;; look++) {
     size_t mark = taken();
     int is_last = look == most_looks, answer = glanced(&now, call->eyes, call->views, is_last, o);

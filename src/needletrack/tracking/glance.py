@@ -19,7 +19,7 @@ from needletrack.geometry.spline import arc_length
 from needletrack.geometry.stereo import StereoRig
 from needletrack.kernels import address, call, two_tip_views
 from needletrack.records import Appearance, Float, Image, Reason
-from needletrack.tracking.adjust import MOVED
+from needletrack.tracking.adjust import MOVED, Expectation, Looks
 from needletrack.tracking.axis import (
     FOUND,
     MOST_CONTROL,
@@ -45,7 +45,7 @@ from needletrack.tracking.ends import (
     TIP_BEYOND_MM,
     EndsParameters,
 )
-from needletrack.tracking.evidence import BLURS, LIVELY, banks, no_needle_bank
+from needletrack.tracking.evidence import BLURS, LIVELY, WIDE, banks, no_needle_bank
 from needletrack.tracking.fit import CurveFit, FitParameters
 from needletrack.tracking.needle import Needle
 from needletrack.tracking.profile import EDGE_SPREAD_PX, FLANK_PX, Mask
@@ -77,7 +77,9 @@ _FARTHER_MM, _FARTHEST_ADVANCE_MM = 5.0, 8.0
 # Nor is it off from where its motion would take it by more than a few of these, a second.
 ADVANCE_SIGMA_MM_S = 18.0
 # A needle is looked at again, at most so often, where it was found this far aside of where it was looked for, mm.
-MOST_LOOKS, SETTLED_MM = 4, 0.15
+MOST_LOOKS, SETTLED_MM = 4, 0.25
+# A needle that moves is looked for roughly first, which takes a fourth of a look, in sections so long.
+_ROUGHLY, _ROUGH_SECTION_MM = Looks((0.7, 0.4), WIDE, Expectation.MOVED, with_streak=False), 2.0
 # The tip is looked for this far beyond where the needle was followed to, in so many rounds.
 TIP_REACH_MM, TIP_ROUNDS = 12.0, 4
 # Where it is found so far beyond that end, what lies beyond it is looked at as well.
@@ -122,6 +124,7 @@ class Steady:
 
     since_s: how long ago that was; advance_mm: how far its tip comes in that time. length_mm: where the tip is expected
     from the base, which the end of a curve that was looked at already is not; None: advance_mm beyond its end.
+    is_moving: it may be well aside of there.
     is_same_pair: it was seen in the very images that are looked at, which then are not to be told twice.
     """
 
@@ -131,6 +134,7 @@ class Steady:
     since_s: float
     advance_mm: float
     length_mm: float | None = None
+    is_moving: bool = False
     is_same_pair: bool = False
 
 
@@ -168,7 +172,7 @@ def glance(
     points_mm = np.ascontiguousarray(steady.points_mm)
     now.before_mm, now.before = kept.at(points_mm), len(points_mm)
     now.advance_mm, now.taper_mm, now.since_s = steady.advance_mm, steady.taper_mm, steady.since_s
-    now.most_looks = most_looks
+    now.most_looks, now.roughly_first = most_looks, steady.is_moving
     now.foreseen_sigma_mm = ADVANCE_SIGMA_MM_S * steady.since_s
     if steady.length_mm is not None:
         now.foreseen_off_mm = steady.length_mm - (float(arc_length(points_mm)[-1]) + steady.advance_mm)
@@ -210,6 +214,9 @@ class _Glance(ctypes.Structure):
         ("advance_mm", D),
         ("taper_mm", D),
         ("since_s", D),
+        ("roughly_first", I),
+        ("rough", Axis),
+        ("rough_section_mm", D),
         ("white_share", D),
         ("most_looks", I),
         ("settled_mm", D),
@@ -323,22 +330,31 @@ class _Room:
         )
 
 
+def _axis(needle: Needle, looks: Looks, appearance: Appearance, kept: Kept) -> Axis:
+    """The axis of a needle of this appearance, looked for like this."""
+    axis = axis_of(needle, looks.grid, looks.spreads, kept)
+    for width in {*range(0, appearance.half_width, _WIDTH_STEP), appearance.half_width}:
+        banks(looks.grid).bank(appearance.inside, appearance.blur, width)
+    axis.half_width, axis.lively = appearance.half_width, looks.with_streak and appearance.inside == LIVELY
+    axis.banks = kept.at(banks(looks.grid).addresses[appearance.inside, appearance.blur])
+    axis.none_bank = kept.at(no_needle_bank(BLURS[appearance.blur]))
+    return axis
+
+
 @lru_cache(maxsize=16)
 def _wanted(parameters: GlanceParameters, appearance: Appearance) -> tuple[_Glance, Kept]:
     """What does not change from pair to pair; and the arrays that it points to."""
-    needle, looks, kept = parameters.needle, MOVED, Kept()
-    axis, spline = axis_of(needle, looks.grid, looks.spreads, kept), spline_of(parameters.fit, kept)
-    for width in {*range(0, appearance.half_width, _WIDTH_STEP), appearance.half_width}:
-        banks(looks.grid).bank(appearance.inside, appearance.blur, width)
+    needle, kept = parameters.needle, Kept()
+    axis, rough = (_axis(needle, looks, appearance, kept) for looks in (MOVED, _ROUGHLY))
     axis.rows_per_section = round(_SECTION_SHARE * ROWS_PER_SECTION)
-    axis.half_width, axis.lively = appearance.half_width, appearance.inside == LIVELY
-    axis.banks = kept.at(banks(looks.grid).addresses[appearance.inside, appearance.blur])
-    axis.none_bank = kept.at(no_needle_bank(BLURS[appearance.blur]))
+    spline = spline_of(parameters.fit, kept)
     spline.systematic_px = parameters.fit.systematic_px[appearance.inside]
     prior, log_prior = prior_of_parts()
     return _Glance(
         axis=axis,
         spline=spline,
+        rough=rough,
+        rough_section_mm=_ROUGH_SECTION_MM,
         white_share=WORTH_A_LOOK,
         settled_mm=SETTLED_MM,
         spacing_mm=parameters.spacing_mm,

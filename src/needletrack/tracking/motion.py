@@ -34,6 +34,13 @@ def foreseen_mm(curve: NeedleCurve, since_s: float) -> Float:
     return np.asarray(curve.points_mm + curve.velocity_mm_s * since_s)
 
 
+def moves_mm(curve: NeedleCurve, since_s: float) -> float:
+    """How far a curve comes aside in so long, at most, mm; infinite where its motion is not known."""
+    if curve.velocity_mm_s is None:
+        return np.inf
+    return float(np.abs(curve.velocity_mm_s).max()) * since_s
+
+
 def moving_like(curve: NeedleCurve, other: NeedleCurve) -> NeedleCurve:
     """A curve that moves as another fit of the same needle does, at the same distances from the base."""
     if other.velocity_mm_s is None:

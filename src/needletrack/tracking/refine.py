@@ -43,7 +43,7 @@ from needletrack.tracking.glance import (
     glance,
 )
 from needletrack.tracking.grow import Growth, grow
-from needletrack.tracking.motion import foreseen_mm
+from needletrack.tracking.motion import foreseen_mm, moves_mm
 from needletrack.tracking.needle import Needle, Positive, Workspace
 from needletrack.tracking.profile import Mask
 from needletrack.tracking.silhouette import AxisOffsets, diameter_mm
@@ -67,6 +67,8 @@ _MOST_ODDS = 30.0
 _TIP_MOVED_MM = 0.3
 # Where a line is looked for beyond the tip: its blur, and the error of a tip that was found, end before.
 _BEYOND_MM, _BEYOND_STEP_MM = (1.5, 6.5), 0.5
+# A needle that comes so far aside from pair to pair does not come just as far as the time before.
+_ROUGHLY_FIRST_MM = 0.2
 # Images without stamps are of a sequence as fast as cameras are.
 _USUAL_S = 1 / 30
 # Weaknesses of a track that is followed nevertheless: its shape is that of the needle, to its end.
@@ -280,7 +282,7 @@ def glanced(
     if first_mm is not None:
         advance_mm = float(np.clip(steady.advance_mm, -MOST_ADVANCE_MM, MOST_ADVANCE_MM))
         length_mm = float(arc_length(steady.points_mm)[-1]) + advance_mm
-        steady = replace(steady, points_mm=first_mm, advance_mm=0.0, length_mm=length_mm)
+        steady = replace(steady, points_mm=first_mm, advance_mm=0.0, length_mm=length_mm, is_moving=False)
     seen = glance(
         images,
         rig,
@@ -469,6 +471,7 @@ def _steady(previous: NeedleTrack, since_s: float, models: RefineModels) -> Stea
         taper_mm,
         since_s if since_s > 0 else _USUAL_S,
         0.0 if tip is None or tip.velocity_mm_s is None else float(tip.velocity_mm_s @ tip.direction) * since_s,
+        is_moving=moves_mm(previous.curve, since_s) > _ROUGHLY_FIRST_MM,
         is_same_pair=since_s <= 0,
     )
 

@@ -45,7 +45,7 @@ from needletrack.tracking.ends import (
     TIP_BEYOND_MM,
     EndsParameters,
 )
-from needletrack.tracking.evidence import BLURS, LIVELY, WIDE, banks, no_needle_bank
+from needletrack.tracking.evidence import BLURS, LIVELY, NEAR, WIDE, banks, no_needle_bank
 from needletrack.tracking.fit import CurveFit, FitParameters
 from needletrack.tracking.needle import Needle
 from needletrack.tracking.profile import EDGE_SPREAD_PX, FLANK_PX, Mask
@@ -79,7 +79,8 @@ ADVANCE_SIGMA_MM_S = 18.0
 # A needle is looked at again, at most so often, where it was found this far aside of where it was looked for, mm.
 MOST_LOOKS, SETTLED_MM = 4, 0.25
 # A needle that moves is looked for roughly first, which takes a fourth of a look, in sections so long.
-_ROUGHLY, _ROUGH_SECTION_MM = Looks((0.7, 0.4), WIDE, Expectation.MOVED, with_streak=False), 2.0
+_ROUGHLY, _ROUGH_SECTION_MM = Looks((0.7, 0.4), WIDE, Expectation.MOVED, with_streak=False), 3.0
+_NEARLY = Looks((0.7, 0.4, 0.2), NEAR, Expectation.MOVED)
 # The tip is looked for this far beyond where the needle was followed to, in so many rounds.
 TIP_REACH_MM, TIP_ROUNDS = 12.0, 4
 # Where it is found so far beyond that end, what lies beyond it is looked at as well.
@@ -216,6 +217,7 @@ class _Glance(ctypes.Structure):
         ("since_s", D),
         ("roughly_first", I),
         ("rough", Axis),
+        ("near", Axis),
         ("rough_section_mm", D),
         ("white_share", D),
         ("most_looks", I),
@@ -345,8 +347,8 @@ def _axis(needle: Needle, looks: Looks, appearance: Appearance, kept: Kept) -> A
 def _wanted(parameters: GlanceParameters, appearance: Appearance) -> tuple[_Glance, Kept]:
     """What does not change from pair to pair; and the arrays that it points to."""
     needle, kept = parameters.needle, Kept()
-    axis, rough = (_axis(needle, looks, appearance, kept) for looks in (MOVED, _ROUGHLY))
-    axis.rows_per_section = round(_SECTION_SHARE * ROWS_PER_SECTION)
+    axis, rough, near = (_axis(needle, looks, appearance, kept) for looks in (MOVED, _ROUGHLY, _NEARLY))
+    axis.rows_per_section = near.rows_per_section = round(_SECTION_SHARE * ROWS_PER_SECTION)
     spline = spline_of(parameters.fit, kept)
     spline.systematic_px = parameters.fit.systematic_px[appearance.inside]
     prior, log_prior = prior_of_parts()
@@ -354,6 +356,7 @@ def _wanted(parameters: GlanceParameters, appearance: Appearance) -> tuple[_Glan
         axis=axis,
         spline=spline,
         rough=rough,
+        near=near,
         rough_section_mm=_ROUGH_SECTION_MM,
         white_share=WORTH_A_LOOK,
         settled_mm=SETTLED_MM,

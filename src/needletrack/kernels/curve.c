@@ -144,16 +144,12 @@ int cut_across(const Axis *a, const Eye *eye, const double *local, int64_t n, To
   return FOUND;
 }
 
-int weigh(const Axis *a, int64_t n, const int64_t *width, int expectation, Told *t) {
-  if (n < 1) return NOT_HELD;
+/* The evidence of n sections of these half widths, over that of no needle. log (n, shifts): out. */
+static int needle_or_none(const Axis *a, int64_t n, const int64_t *width, Told *t, double *log) {
   int64_t samples = a->samples, f = features(samples), s = shifts_of(a), p = a->places;
   size_t mark = taken();
-  double *log = TAKE(double, n * s), *half = TAKE(double, n), *axis = TAKE(double, n),
-         *streak_work = TAKE(double, (3 * samples + 1) * n);
-  float *both = TAKE(float, 2 * n * s), *spare = TAKE(float, 4 * n * columns_of(p > a->edges + 1 ? p : a->edges + 1));
-  int64_t *path = TAKE(int64_t, n);
-  if (!path) return NO_MEMORY;
-  no_needle(t->shown, n, samples, a->none_bank, a->edges, t->none, spare);
+  float *both = TAKE(float, 2 * n * s), *spare = TAKE(float, 4 * n * columns_of(p));
+  if (!spare) return NO_MEMORY;
   for (int64_t first = 0, last; first < n; first = last) {
     for (last = first + 1; last < n && width[last] == width[first];) last++;
     if (width[first] < 0) {
@@ -165,6 +161,22 @@ int weigh(const Axis *a, int64_t n, const int64_t *width, int expectation, Told 
     over_none(both, t->none + first, last - first, s, log + first * s, t->cluttered + first);
   }
   prepared(log, n, s, a->refine, a->fine_shifts, a->never, (float)a->outlier, t->most, t->relative, t->likelihood);
+  give_back(mark);
+  return FOUND;
+}
+
+int weigh(const Axis *a, int64_t n, const int64_t *width, int expectation, Told *t) {
+  if (n < 1) return NOT_HELD;
+  int64_t samples = a->samples, s = shifts_of(a), p = a->places;
+  size_t mark = taken();
+  double *log = TAKE(double, n * s), *half = TAKE(double, n), *axis = TAKE(double, n),
+         *streak_work = TAKE(double, (3 * samples + 1) * n);
+  float *spare = TAKE(float, 4 * n * columns_of(a->edges + 1));
+  int64_t *path = TAKE(int64_t, n);
+  if (!path) return NO_MEMORY;
+  no_needle(t->shown, n, samples, a->none_bank, a->edges, t->none, spare);
+  int failed = needle_or_none(a, n, width, t, log);
+  if (failed) return failed;
   double low = -a->step * (double)(p - 1);
   if (expectation == STAYED) memset(t->expected, 0, (size_t)n * sizeof(double));
   else {
@@ -193,6 +205,29 @@ int weigh(const Axis *a, int64_t n, const int64_t *width, int expectation, Told 
     t->shines[i] = seen > 0 && isfinite(t->streak_sigma[i]);
     t->doubtful[i] = t->shines[i] && t->cluttered[i];
   }
+  give_back(mark);
+  return FOUND;
+}
+
+Told told_from(const Axis *a, const Told *t, int64_t first) {
+  Told from = *t;
+  from.center += 2 * first, from.normal += 2 * first, from.values += first * a->samples;
+  from.scale += first, from.none += first, from.most += first, from.expected += first;
+  from.offset += first, from.sigma += first, from.support += first;
+  from.streak += first, from.streak_sigma += first;
+  from.inside += first, from.cluttered += first, from.doubtful += first, from.shines += first;
+  from.shown += first * features(a->samples);
+  from.relative += first * shifts_of(a), from.likelihood += first * a->fine_shifts;
+  return from;
+}
+
+int weigh_anew(const Axis *a, int64_t n, const int64_t *width, Told *t) {
+  size_t mark = taken();
+  double *log = TAKE(double, n * shifts_of(a));
+  if (!log) return NO_MEMORY;
+  int failed = needle_or_none(a, n, width, t, log);
+  if (failed) return failed;
+  for (int64_t i = 0; i < n; i++) t->doubtful[i] = t->shines[i] && t->cluttered[i];
   give_back(mark);
   return FOUND;
 }

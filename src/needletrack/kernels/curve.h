@@ -100,6 +100,10 @@ int room_to_tell(const Axis *a, int64_t n, Told *t);
 int cut_across(const Axis *a, const Eye *eye, const double *local, int64_t n, Told *t);
 /* What sections of half widths (n,), as indices, -1: too thin, tell of the axis and of a streak. */
 int weigh(const Axis *a, int64_t n, const int64_t *width, int expectation, Told *t);
+/* What they tell of the axis where they have other half widths than they were weighed with. */
+int weigh_anew(const Axis *a, int64_t n, const int64_t *width, Told *t);
+/* The same sections from one of them on. */
+Told told_from(const Axis *a, const Told *t, int64_t first);
 /* The axis where it is expected, give or take `spread`. */
 void look(const Axis *a, Told *t, int64_t n, double spread);
 /* Where a curve (n, 3) leads to expect the axis; local (n, 3), px (n, 2): spare. */

@@ -327,12 +327,21 @@ static int glanced(const Glance *g, const Eye *eyes, TipView *views, int is_last
   int64_t index = 0;
   for (int64_t i = 1; i < n; i++) index = fabs(moved_arc[i] - tip[0]) < fabs(moved_arc[index] - tip[0]) ? i : index;
 
-  /* What was expected where the last look looked is what supports it; its offsets stand. */
+  /* What was expected where the last look looked is what supports it; its offsets stand, but where the needle is not as
+     thick there as it was thought to be before its tip was found. */
+  int64_t *width = TAKE(int64_t, n), thinner = 0;
+  double *before_tip = TAKE(double, n), narrow = g->axis.spreads[g->axis.looks - 1];
+  if (!before_tip) return NO_MEMORY;
+  for (int64_t i = 0; i < n; i++) before_tip[i] = tip[0] - moved_arc[i];
+  tapered(g, before_tip, n, width);
+  while (thinner < n && width[thinner] == c.width[thinner]) thinner++;
   for (int v = 0; v < 2; v++) {
-    Told *t = told + v, again = *t;
+    Told *t = told + v, again = *t, end = told_from(&g->axis, t, thinner);
     again.offset = again.sigma = 0;
+    if (thinner < n && (failed = weigh_anew(&g->axis, n - thinner, width + thinner, &end))) return failed;
     expect(eyes[v].posed, t, moved, n, local, px);
-    look(&g->axis, &again, n, g->axis.spreads[g->axis.looks - 1]);
+    look(&g->axis, &again, n, narrow);
+    if (thinner < n) look(&g->axis, &end, n - thinner, narrow);
   }
 
   /* The curve once more, to the ends that both views show as well. */

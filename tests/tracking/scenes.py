@@ -111,3 +111,35 @@ def steered_fast(seed: int) -> World:
         rods = (Rod((-45.0, heights_mm[0], 228.0), (45.0, heights_mm[1], 232.0), random.uniform(0.5, 2)),)
     background = Background(contrast=random.uniform(0, 15), vessels=int(random.integers(0, 7)))
     return World(default_rig((960, 768)), needle, background, lighting, seed=seed, rods=rods)
+
+
+def drawn_at_random(seed: int) -> World:
+    """A needle of any lighting, bend and motion, before a background and beside a rod as the seed has them.
+
+    Sleeves and rods of metal have streaks of light on them that look like needles.
+    """
+    random = np.random.default_rng(seed)
+    size_px = ((960, 768), (1280, 1024), (1600, 1200))[int(random.integers(3))]
+    needle = NeedleMotion(
+        (8.0 + random.uniform(-12, 12), -34.0 + random.uniform(-8, 8), 246.0 + random.uniform(-20, 25)),
+        (random.uniform(-0.6, 0.6), 1.0, random.uniform(-0.5, 0.5)),
+        Wave(random.uniform(40, 85), random.uniform(0, 8), random.uniform(0.5, 2.0)),
+        bend_per_mm=Wave(random.uniform(-0.006, 0.006), random.uniform(0, 0.004), random.uniform(0.5, 1.5)),
+        bend_plane_rad=Wave(random.uniform(0, 6), random.uniform(0, 1), random.uniform(0.7, 2)),
+        shift_mm=(
+            Wave(0.0, random.uniform(0, 2), random.uniform(0.5, 1.5)),
+            Wave(0.0, random.uniform(0, 2), random.uniform(0.5, 1.5)),
+            Wave(0.0, random.uniform(0, 2), random.uniform(0.5, 1.5)),
+        ),
+    )
+    rods: tuple[Rod, ...] = ()
+    if random.random() >= 0.6:
+        rods = (
+            Rod(
+                (-45.0 + random.uniform(-10, 10), -30.0, 235.0 - random.uniform(0, 40)),
+                (-30.0 + random.uniform(0, 60), 45.0, 240.0 - random.uniform(0, 40)),
+            ),
+        )
+    lighting = (STEEL, STEEL, DARK_ON_LIGHT, LIGHT_ON_DARK)[int(random.integers(4))]
+    background = Background(contrast=random.uniform(0, 16), vessels=int(random.integers(0, 9)))
+    return World(default_rig(size_px), needle, background, lighting, seed=seed, rods=rods)

@@ -149,6 +149,14 @@ def test_what_is_not_known_is_weak() -> None:
     assert reasons(quality=replace(GOOD, coverage=None)) == (Reason.LOW_COVERAGE,)
 
 
+def test_a_tip_that_hangs_by_nothing_is_none() -> None:
+    seen = np.full(len(curve().points_mm), 2)
+    seen[-5:] = 0
+    assert reasons(shape=replace(curve(), seen=seen)) == ()
+    seen[-6:] = 0
+    assert reasons(shape=replace(curve(), seen=seen)) == (Reason.TIP_NOT_SEEN,)
+
+
 def test_a_few_uncertain_points_are_allowed() -> None:
     n = len(curve().points_mm)
     sigma_mm = np.full(n, 0.05)

@@ -15,6 +15,7 @@ from tests.tracking.scenes import (
     SIZE_PX,
     WORLDS,
     Scene,
+    drawn_at_random,
     scene,
     seen_at,
     steered_fast,
@@ -465,6 +466,37 @@ def test_a_dark_rod_is_not_taken_for_the_sleeve(y_mm: float, diameter_mm: float,
     assert result.turned in {None, False} or found.status is not Status.OK
 
 
+def misled(seed: int) -> list[int]:
+    """The pairs, of three, in which a needle drawn at random was called ok and was not there."""
+    world, track, wrong = drawn_at_random(seed), None, []
+    for number, (pair, truth) in enumerate(world.pairs(30.0, 3)):
+        track = track_pair(pair, world.rig, None, track)
+        if score(track, TrueShape.drawn(truth)).false_ok:
+            wrong.append(number)
+    return wrong
+
+
+@pytest.mark.parametrize("seed", [5, 132], ids=["streak of the sleeve", "streak of a rod"])
+def test_a_streak_of_light_on_what_is_no_needle_does_not_mislead(seed: int) -> None:
+    assert not misled(seed)
+
+
+@pytest.mark.parametrize("seed", [4, 419])
+def test_a_tip_that_swings_farther_than_a_look_reaches_is_followed(seed: int) -> None:
+    # By 2.3 to 2.8 mm from pair to pair; a curve a millimetre aside of the needle explains what was looked at.
+    world, track = drawn_at_random(seed), None
+    for pair, truth in world.pairs(30.0, 3):
+        track = track_pair(pair, world.rig, None, track)
+        assert track.status is Status.OK
+        assert score(track, TrueShape.drawn(truth)).tip_mm == pytest.approx(0.0, abs=TIP_MM)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("first", range(0, 120, 30))
+def test_what_is_called_ok_is_the_needle(first: int) -> None:
+    assert {seed: pairs for seed in range(first, first + 30) if (pairs := misled(seed))} == {}
+
+
 def test_a_tip_behind_a_rod_is_not_given() -> None:
     tip_px = RIG.left.project(scene("dark").truth.tip_mm[None])[0]
     ray = RIG.left.normalize(tip_px[None])[0]
@@ -506,9 +538,9 @@ def test_from_the_pair_before_comes_the_same_shape_as_alone() -> None:
         # But for the base, a stretch of whose first spacing is in one of them only. Both err, each by its sigma.
         apart_mm = distance_from_curve(followed.curve.points_mm[4:], alone.curve.points_mm)
         assert (apart_mm <= np.sqrt(2) * followed.curve.sigma_mm[4:]).all()
-        assert (
-            distance_from_curve(followed.curve.points_mm[4:], shown.truth.centerline_mm) <= followed.curve.sigma_mm[4:]
-        ).all()
+        off_mm = distance_from_curve(followed.curve.points_mm[4:], shown.truth.centerline_mm)
+        assert (off_mm <= 2 * followed.curve.sigma_mm[4:]).all()
+        assert (off_mm <= followed.curve.sigma_mm[4:]).mean() > 0.9
         assert score(followed, TrueShape.drawn(shown.truth)).tip_mm == pytest.approx(0.0, abs=TIP_MM)
 
 

@@ -232,6 +232,43 @@ int weigh_anew(const Axis *a, int64_t n, const int64_t *width, Told *t) {
   return FOUND;
 }
 
+/* Log evidence of places of a grid (s,), over `most`, at a place between two of them; no less than `floor_log`. */
+static double evidence_at(const double *log, int64_t s, double place, double most, double floor_log) {
+  if (!(place >= 0 && place <= (double)(s - 1))) return floor_log;
+  int64_t k = (int64_t)place < s - 1 ? (int64_t)place : s - 2;
+  double over = log[k] + (place - (double)k) * (log[k + 1] - log[k]) - most;
+  return over > floor_log ? over : floor_log;
+}
+
+int likelier_elsewhere(const Axis *a, const Told *told, int64_t n, const int64_t *width, double least_gain, double *off) {
+  int64_t s = shifts_of(a), counted = 0;
+  size_t mark = taken();
+  Told t = *told;
+  double *log = TAKE(double, n * s), *place = TAKE(double, n), best, here = 0;
+  t.most = TAKE(double, n), t.relative = TAKE(float, n * s), t.likelihood = TAKE(float, n * a->fine_shifts);
+  t.cluttered = TAKE(uint8_t, n);
+  if (!t.cluttered) return NO_MEMORY;
+  int failed = needle_or_none(a, n, width, &t, log);
+  if (failed) return failed;
+  for (int64_t i = 0; i < n; i++) {
+    place[i] = width[i] < 0 || !t.inside[i] ? NAN : t.expected[i] / t.scale[i] / a->step + (double)(s - 1) / 2;
+    counted += place[i] >= 0;
+    if (place[i] >= 0) here += evidence_at(log + i * s, s, place[i], t.most[i], a->floor_log);
+  }
+  *off = 0, best = here + least_gain * (double)counted;
+  for (int turn = -2; turn <= 2; turn++)
+    for (int64_t shift = 1 - s; shift < s; shift++) {
+      double sum = 0, aside = (double)shift * a->step, most = fabs(aside) + fabs(turn / 2.0);
+      for (int64_t i = 0; i < n; i++) {
+        double here_aside = aside + turn * ((double)i / (double)n - 0.5);
+        if (place[i] >= 0) sum += evidence_at(log + i * s, s, place[i] + here_aside / a->step, t.most[i], a->floor_log);
+      }
+      if (sum > best) best = sum, *off = most;
+    }
+  give_back(mark);
+  return FOUND;
+}
+
 void look(const Axis *a, Told *t, int64_t n, double spread) {
   sites(t->most, t->relative, t->likelihood, n, -a->step * (double)(a->places - 1), a->step, shifts_of(a),
         a->fine_step, a->fine_shifts, t->expected, spread, t->scale, t->inside, t->doubtful, a->least_gain,

@@ -102,6 +102,9 @@ int cut_across(const Axis *a, const Eye *eye, const double *local, int64_t n, To
 int weigh(const Axis *a, int64_t n, const int64_t *width, int expectation, Told *t);
 /* What they tell of the axis where they have other half widths than they were weighed with. */
 int weigh_anew(const Axis *a, int64_t n, const int64_t *width, Told *t);
+/* How far off, units, n sections would rather have the axis than where it is expected, moved aside as a whole or turned;
+   0 where that is likelier by no more than least_gain, log odds a section. a: on which grid. */
+int likelier_elsewhere(const Axis *a, const Told *t, int64_t n, const int64_t *width, double least_gain, double *off);
 /* The same sections from one of them on. */
 Told told_from(const Axis *a, const Told *t, int64_t first);
 /* The axis where it is expected, give or take `spread`. */

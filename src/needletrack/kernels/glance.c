@@ -18,6 +18,8 @@ typedef struct {
   int64_t roughly_first;
   Axis rough, near;
   double rough_section_mm;
+  /* Its end is elsewhere where sections of so long a stretch say so, by so much each. */
+  double end_mm, elsewhere_gain;
   /* How the curve is sampled. */
   /* A needle that is white along more than this share of it is another matter. */
   double white_share;
@@ -52,6 +54,8 @@ typedef struct {
   /* How often it was looked at, and how far aside of where it was looked for last it lies. */
   int64_t looks;
   double aside_mm;
+  /* And how far aside its end is seen instead. */
+  double elsewhere_mm;
 } Found;
 
 /* Half widths of the needle (n,) before its tip, as indices; -1 where it is thinner than all of them. */
@@ -370,15 +374,25 @@ static int glanced(const Glance *g, const Eye *eyes, TipView *views, int is_last
   curve(fitting.control, fitting.first, fitting.mixing, n, moved);
   lengths(moved, n, moved_arc);
   o->aside_mm = farthest_aside(points, moved, index + 1);
+  /* Or is its end seen elsewhere, farther away than a look reaches? */
+  int64_t stretch = (int64_t)rint(g->end_mm / g->section_mm), begin = index + 1 > stretch ? index + 1 - stretch : 0;
+  double off[2];
+  for (int v = 0; v < 2; v++) {
+    Told *t = told + v, end = told_from(&g->axis, t, begin);
+    expect(eyes[v].posed, t, moved, n, local, px);
+    failed = likelier_elsewhere(&g->rough, &end, index + 1 - begin, width + begin, g->elsewhere_gain, off + v);
+    if (failed) return failed;
+  }
+  o->elsewhere_mm = (off[0] < off[1] ? off[0] : off[1]) * g->axis.unit_mm;
 
   /* Cut at the tip. The curve as fitted once more may be a little shorter than it was. */
-  double end_mm = tip[0] < moved_arc[n - 1] ? tip[0] : moved_arc[n - 1];
-  int64_t count = (int64_t)rint(end_mm / g->spacing_mm) + 1, k = 0;
+  double cut_mm = tip[0] < moved_arc[n - 1] ? tip[0] : moved_arc[n - 1];
+  int64_t count = (int64_t)rint(cut_mm / g->spacing_mm) + 1, k = 0;
   count = count < 8 ? 8 : count;
   /* A curve that became so much longer than it was winds about nothing. */
   if (count > o->room) return NOT_HELD;
   for (int64_t i = 0; i < count; i++) {
-    double here = end_mm * (double)i / (double)(count - 1);
+    double here = cut_mm * (double)i / (double)(count - 1);
     while (k < n - 2 && moved_arc[k + 1] < here) k++;
     o->parameters[i] = fitting.u[k] + (here - moved_arc[k]) / (moved_arc[k + 1] - moved_arc[k]) * (fitting.u[k + 1] - fitting.u[k]);
   }
@@ -388,7 +402,7 @@ static int glanced(const Glance *g, const Eye *eyes, TipView *views, int is_last
   basis(o->parameters, count, fitting.m, 0, cut_first, cut_mixing);
   curve(fitting.control, cut_first, cut_mixing, count, o->points_mm);
   o->count = count, o->control_count = fitting.m;
-  if (!is_last && o->aside_mm >= g->settled_mm) return FOUND;
+  if (!is_last && (o->aside_mm >= g->settled_mm || o->elsewhere_mm > 0)) return FOUND;
 
   double *residual = TAKE(double, 2 * n);
   if (!residual) return NO_MEMORY;
@@ -407,13 +421,13 @@ static int glanced(const Glance *g, const Eye *eyes, TipView *views, int is_last
   }
 
   /* Whether the end is free. */
-  double begin = tip[0] - g->beside_before_mm, finish = tip[0] + g->beside_beyond_mm;
-  begin = begin > 0 ? begin : 0;
-  int64_t around = (int64_t)rint((finish - begin) / g->spacing_mm) + 1;
+  double from = tip[0] - g->beside_before_mm, finish = tip[0] + g->beside_beyond_mm;
+  from = from > 0 ? from : 0;
+  int64_t around = (int64_t)rint((finish - from) / g->spacing_mm) + 1;
   around = around < 8 ? 8 : around;
   double *about_at = TAKE(double, around), *about = TAKE(double, 3 * around);
   if (!about) return NO_MEMORY;
-  for (int64_t i = 0; i < around; i++) about_at[i] = begin + (finish - begin) * (double)i / (double)(around - 1);
+  for (int64_t i = 0; i < around; i++) about_at[i] = from + (finish - from) * (double)i / (double)(around - 1);
   interpolated(along, along_arc, along_count, about_at, around, about);
   o->is_free = !crossed(g, eyes, about, around, tip[0] < g->beside_before_mm ? tip[0] : g->beside_before_mm);
   return FOUND;
@@ -436,24 +450,24 @@ static int settled(const Call *call, int64_t most_looks) {
   lengths(now.before_mm, now.before, arc);
   double most = now.most_advance_mm, advance = now.advance_mm < -most ? -most : now.advance_mm > most ? most : now.advance_mm;
   double foreseen = arc[now.before - 1] + advance + now.foreseen_off_mm;
-  if (now.roughly_first) {
-    size_t mark = taken();
-    double *rough = TAKE(double, 3 * o->room);
-    int64_t count;
-    if (!rough) return NO_MEMORY;
-    int answer = roughly(&now, call->eyes, o->room, &count, rough);
-    if (answer == NO_MEMORY) return answer;
-    if (answer == FOUND) {
-      memcpy(line, rough, (size_t)(3 * count) * sizeof *line);
-      lengths(line, count, arc);
-      now.before_mm = line, now.before = count, now.advance_mm = 0, now.foreseen_off_mm = foreseen - arc[count - 1];
-      now.axis = now.near;
-    }
-    give_back(mark);
-  }
   for (int64_t look = 1;; look++) {
     size_t mark = taken();
-    int is_last = look == most_looks, answer = glanced(&now, call->eyes, call->views, is_last, o);
+    int is_last = look == most_looks, answer = FOUND;
+    if (look == 1 ? now.roughly_first : o->elsewhere_mm > 0) {
+      double *rough = TAKE(double, 3 * o->room);
+      int64_t count;
+      if (!rough) return NO_MEMORY;
+      answer = roughly(&now, call->eyes, o->room, &count, rough);
+      if (answer == FOUND) {
+        memcpy(line, rough, (size_t)(3 * count) * sizeof *line);
+        lengths(line, count, arc);
+        now.before_mm = line, now.before = count, now.advance_mm = 0, now.foreseen_off_mm = foreseen - arc[count - 1];
+        now.axis = now.near;
+      }
+      if (answer != NO_MEMORY) give_back(mark);
+    }
+    /* What is not seen roughly may be seen all the same. */
+    if (answer != NO_MEMORY) answer = glanced(&now, call->eyes, call->views, is_last, o);
     if (answer == NO_MEMORY) return answer;
     give_back(mark);
     if (answer != FOUND && look > 1) {
@@ -462,7 +476,7 @@ static int settled(const Call *call, int64_t most_looks) {
       return settled(call, look - 1);
     }
     o->looks = look;
-    if (answer != FOUND || is_last || o->aside_mm < now.settled_mm) return answer;
+    if (answer != FOUND || is_last || (o->aside_mm < now.settled_mm && !(o->elsewhere_mm > 0))) return answer;
     /* Where its tip is expected stays what its motion foretold: what was just seen is not to be told twice. */
     memcpy(line, o->points_mm, (size_t)(3 * o->count) * sizeof *line);
     lengths(line, o->count, arc);

@@ -19,6 +19,10 @@ _ACROSS_STEP_PX = 0.5
 # A line beyond the needle's end is looked for within so much of the curve, and its flanks so far from its edges.
 _LINE_OFF_PX, _FLANK_FROM_PX, _FLANK_TO_PX = 1.5, 1.5, 4.0
 
+# A side runs along at a distance from here to there beyond the needle's own edge and in steps of, mm; along so much of
+# a curve what lies so far beyond it differs from what lies as far within.
+_SIDE_FROM_MM, _SIDE_TO_MM, _SIDE_STEP_MM, _SIDE_SHARE, _EDGE_MM = 0.65, 8.0, 0.1, 0.8, (0.1, 0.4)
+
 
 class BesideParameters(BaseModel):
     """What counts as a line along the curve."""
@@ -81,6 +85,26 @@ def line_height_gray(image: Image, camera: Camera, points_mm: Float, diameter_mm
         height = float(np.sign(over[0]) * np.abs(over).min()) if over[0] * over[1] > 0 else 0.0
         most = height if abs(height) > abs(most) else most
     return most
+
+
+def sides_gray(image: Image, camera: Camera, points_mm: Float, diameter_mm: float) -> Float:
+    """How strong an edge runs along a curve (N, 3) on either side (2,), wider than the needle, grey levels.
+
+    The curve is given in this camera's frame. An edge is as strong as four fifths of the curve show it at least, in the
+    same sense and at the same distance.
+    """
+    radii_mm = np.arange(diameter_mm / 2 + _SIDE_FROM_MM, _SIDE_TO_MM, _SIDE_STEP_MM)
+    px_per_mm = camera.focal_px / float(np.median(points_mm[:, 2]))
+    offsets_px = _offsets_px((radii_mm[-1] + _EDGE_MM[1]) * px_per_mm)
+    aside_mm = np.stack([-offsets_px, offsets_px])[:, None, :] / px_per_mm - radii_mm[:, None]
+    strip = _strip(image, camera, points_mm, offsets_px, 0.0)
+    beyond, within = (
+        strip @ (mask / np.maximum(mask.sum(axis=-1, keepdims=True), 1)).reshape(-1, len(offsets_px)).T
+        for mask in ((low <= aside_mm) & (aside_mm <= high) for low, high in (_EDGE_MM, (-_EDGE_MM[1], -_EDGE_MM[0])))
+    )
+    low, high = np.quantile(beyond - within, (1 - _SIDE_SHARE, _SIDE_SHARE), axis=0)
+    least = np.where(low * high > 0, np.minimum(np.abs(low), np.abs(high)), 0.0)
+    return np.asarray(least.reshape(2, -1).max(axis=1))
 
 
 def _offsets_px(reach_px: float) -> Float:

@@ -57,8 +57,9 @@ class Grid:
         return cubic_interpolation(len(self.shifts), _FINER).astype(np.float32)
 
 
-# Where the axis is nearly known; where it is not; and where it has to be found and known at one look.
-NEAR, WIDE, FINE, _HERE = Grid(4, 12), Grid(2, 14), Grid(4, 28), Grid(1, 0)
+# Where the axis is nearly known; where it is not; where it has to be found and known at one look; where it may be far
+# away and is wanted roughly.
+NEAR, WIDE, FINE, FAR, _HERE = Grid(4, 12), Grid(2, 14), Grid(4, 28), Grid(1, 13), Grid(1, 0)
 # Sigmas of the lens blur, and half widths (a step of 4 %), for which there are matrices.
 BLURS = (0.45, 0.55, 0.68, 0.84, 1.05, 1.3)
 HALF_WIDTHS = 1.2 * 1.04 ** np.arange(0, 34)

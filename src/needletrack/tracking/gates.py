@@ -14,6 +14,7 @@ from needletrack.tracking.refine import Refined
 
 # Saturation widens a bright needle by up to this much, mm.
 _SATURATION_MM = 0.35
+_BEFORE_TIP_MM = 10.0
 
 
 class GateParameters(BaseModel):
@@ -49,7 +50,10 @@ class GateParameters(BaseModel):
         0.7, description="Largest distance along the needle between both views' tips, mm."
     )
     max_tip_epipolar_px: Positive = Field(
-        1.3, description="Largest distance of one view's tip from the other's epipolar line, px."
+        3.0, description="Largest distance of one view's tip from the other's epipolar line, px."
+    )
+    min_tip_seen_share: float = Field(
+        0.5, ge=0, le=1, description="Smallest share of the last centimetre before the tip that a camera sees."
     )
     max_step_mm: Positive = Field(15.0, description="Largest motion of the tip since the previous pair, mm.")
 
@@ -89,7 +93,9 @@ def weaknesses(
         or refined.fit.streak_misfit > parameters.max_streak_misfit,
         Reason.HIGH_UNCERTAINTY: _percentile_95(curve.sigma_mm) > parameters.max_sigma_mm
         or float(np.sqrt(np.linalg.eigvalsh(refined.tip_covariance_mm2)[-1])) > parameters.max_sigma_mm,
-        Reason.TIP_NOT_SEEN: min(tip.contrast) < parameters.min_tip_contrast or not refined.tip_is_free,
+        Reason.TIP_NOT_SEEN: min(tip.contrast) < parameters.min_tip_contrast
+        or not refined.tip_is_free
+        or _seen_before_tip(curve) < parameters.min_tip_seen_share,
         Reason.TIP_DISAGREES: abs(tip.each_mm[0] - tip.each_mm[1]) > parameters.max_tip_disagreement_mm
         or (quality.epipolar_rms_px or 0.0) > parameters.max_tip_epipolar_px,
         Reason.JUMP: previous is not None
@@ -101,6 +107,12 @@ def weaknesses(
         if found[reason]:
             raise NeedleNotFound("gates", reason)
     return tuple(reason for reason in Reason if found.get(reason, False))
+
+
+def _seen_before_tip(curve: NeedleCurve) -> float:
+    """Share of the points of the last stretch that a camera sees: an end that hangs by nothing is another thing's."""
+    spacing_mm = curve.length_mm / (len(curve.points_mm) - 1)
+    return float((curve.seen[-max(1, round(_BEFORE_TIP_MM / spacing_mm)) :] > 0).mean())
 
 
 def _percentile_95(values: Float) -> float:

@@ -491,6 +491,13 @@ def test_a_tip_that_swings_farther_than_a_look_reaches_is_followed(seed: int) ->
         assert score(track, TrueShape.drawn(truth)).tip_mm == pytest.approx(0.0, abs=TIP_MM)
 
 
+@pytest.mark.parametrize("seed", [610, 638])
+def test_a_rod_that_passes_by_ahead_of_the_tip_does_not_hide_it(seed: int) -> None:
+    found, result = answer(drawn_at_random(seed))
+    assert found.status is Status.OK
+    assert result.tip_mm == pytest.approx(0.0, abs=TIP_MM)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("first", range(0, 120, 30))
 def test_what_is_called_ok_is_the_needle(first: int) -> None:

@@ -17,28 +17,41 @@ int64_t even_features(int64_t count) {
 }
 int64_t features(int64_t count) { return count * (count + 1) / 2 + 1; }
 
+/* The median of (count,): that of which as many are less as are more. Counting is vectors; sorting is not. */
+static double middle_of_samples(const double *v, int64_t count) {
+  float values[MOST_SAMPLES];
+  int32_t below[MOST_SAMPLES] = {0};
+  for (int64_t k = 0; k < count; k++) values[k] = (float)v[k];
+  for (int64_t j = 0; j < count; j++) {
+    float other = values[j];
+    for (int64_t k = 0; k < j; k++) below[k] += other < values[k];
+    for (int64_t k = j; k < count; k++) below[k] += other <= values[k];
+  }
+  double low = 0, high = 0;
+  for (int64_t k = 0; k < count; k++) {
+    /* Each is not more than itself, nor equal ones before it. */
+    if (below[k] - 1 == (count - 1) / 2) low = v[k];
+    if (below[k] - 1 == count / 2) high = v[k];
+  }
+  return (low + high) / 2;
+}
+
 /* The products (n, f) of every two samples, whitened, even and odd, of sections (n, count), and 1.
 
    First those that stay as they are where left and right change places (of two even ones, of two odd ones, and 1), then
    those that change their sign. whitener: (count, count), to even samples and then to odd ones. */
 EXPORT void products(const double *sections, int64_t n, int64_t count, const double *whitener, float *out) {
   int64_t even = even_samples(count);
+  float columns[MOST_SAMPLES * MOST_SAMPLES];
+  for (int64_t j = 0; j < count; j++)
+    for (int64_t k = 0; k < count; k++) columns[j * count + k] = (float)whitener[k * count + j];
   for (int64_t i = 0; i < n; i++) {
     const double *section = sections + i * count;
-    double sorted[MOST_SAMPLES], centered[MOST_SAMPLES];
-    float white[MOST_SAMPLES], *at = out + i * features(count);
-    for (int64_t k = 0; k < count; k++) {
-      int64_t place = k;
-      while (place > 0 && sorted[place - 1] > section[k]) sorted[place] = sorted[place - 1], place--;
-      sorted[place] = section[k];
-    }
-    double median = count % 2 ? sorted[count / 2] : (sorted[count / 2 - 1] + sorted[count / 2]) / 2;
-    for (int64_t k = 0; k < count; k++) centered[k] = section[k] - median;
-    for (int64_t k = 0; k < count; k++) {
-      double sum = 0;
-      for (int64_t j = 0; j < count; j++) sum += whitener[k * count + j] * centered[j];
-      white[k] = (float)sum;
-    }
+    float centered[MOST_SAMPLES], white[MOST_SAMPLES] = {0}, *at = out + i * features(count);
+    double median = middle_of_samples(section, count);
+    for (int64_t k = 0; k < count; k++) centered[k] = (float)(section[k] - median);
+    for (int64_t j = 0; j < count; j++)
+      for (int64_t k = 0; k < count; k++) white[k] += columns[j * count + k] * centered[j];
     for (int64_t k = 0; k < even; at += even - k++)
       for (int64_t j = k; j < even; j++) at[j - k] = white[k] * white[j];
     for (int64_t k = even; k < count; at += count - k++)

@@ -42,6 +42,8 @@ PAIRS_PER_AUDIT, PAIRS_PER_AUDIT_OF_WEAK = 6, 2
 _CONFIRMED_SHARE, _CONFIRMED_PX = 0.5, 5.0
 # What is detected so near to a tip, not behind it, and so long may be more of the needle: the far side of a hook.
 _GOES_ON_WITHIN_MM, _GOES_ON_COSINE, _GOES_ON_MM = 40.0, -0.3, 4.0
+# Farther away than so much it has to lead towards the tip, where it is nearest, by this cosine: rods and vessels pass by.
+_FAR_MM, _LEADS_COSINE = 20.0, 0.5
 _APART_PX = 8.0
 # Tips within so much of each other are the same: an audit confirms one that was followed there, mm.
 _SAME_TIP_MM = 1.0
@@ -370,9 +372,19 @@ def _may_go_on(
         gap = other - points[-1]
         near = np.linalg.norm(gap, axis=1) < _GOES_ON_WITHIN_MM
         near &= (unit(gap) @ ahead) > _GOES_ON_COSINE
-        if near.any() and np.linalg.norm(np.ptp(other[near], axis=0)) > _GOES_ON_MM:
+        if near.any() and np.linalg.norm(np.ptp(other[near], axis=0)) > _GOES_ON_MM and _leads_to(points[-1], other):
             return True
     return False
+
+
+def _leads_to(tip_mm: Float, line_mm: Float) -> bool:
+    """Whether a line (N, 3) comes near a tip, or runs towards it where it is nearest."""
+    gap = line_mm - tip_mm
+    nearest = int(np.argmin(np.linalg.norm(gap, axis=1)))
+    if np.linalg.norm(gap[nearest]) < _FAR_MM:
+        return True
+    along = line_mm[min(nearest + 5, len(line_mm) - 1)] - line_mm[max(nearest - 5, 0)]
+    return bool(abs(unit(along) @ unit(gap[nearest])) > _LEADS_COSINE)
 
 
 def _models(parameters: TrackingParameters) -> RefineModels:

@@ -42,7 +42,7 @@ PAIRS_PER_AUDIT, PAIRS_PER_AUDIT_OF_WEAK = 6, 2
 _CONFIRMED_SHARE, _CONFIRMED_PX = 0.5, 5.0
 # What is detected so near to a tip, not behind it, and so long may be more of the needle: the far side of a hook.
 _GOES_ON_WITHIN_MM, _GOES_ON_COSINE, _GOES_ON_MM = 40.0, -0.3, 4.0
-# Farther away than so much it has to lead towards the tip, where it is nearest, by this cosine: rods and vessels pass by.
+# Farther away than so much it has to lead to the tip, where it is nearest, by this cosine: rods and vessels pass by.
 _FAR_MM, _LEADS_COSINE = 20.0, 0.5
 _APART_PX = 8.0
 # Tips within so much of each other are the same: an audit confirms one that was followed there, mm.

@@ -574,7 +574,8 @@ EXPORT int find_tip(const TipView *views, int64_t shapes, const double *arc_mm, 
       double least = INFINITY;
       for (int64_t k = 0; k < tries; k++) {
         double off = (coarse[k] - foreseen) / rules[9], value = both[shape][k] + 0.5 * off * off;
-        if (value < least) least = value, best = k;
+        /* Each view may prefer a neighbour of its own: then both are as good, and rounding has no say. */
+        if (value < least - 1e-9) least = value, best = k;
       }
       for (int64_t k = 0; k < fine; k++)
         near[shape][k] = coarse[best] + rules[3] * ((double)k - (double)(fine - 1) / 2);

@@ -391,6 +391,29 @@ static double median_of(const double *v, int64_t n, double *work) {
   return n % 2 ? high : (high + selected(copy, n, n / 2 - 1)) / 2;
 }
 
+/* Adds to the lower triangle of fixed (8, 8) the products of one row's kinds, weighted: along a row s is the same, so of
+   the planes only the powers of x (width,) are to be summed. behind, gray (width,). */
+static void add_fixed(const double *x, double s, const double *behind, const double *gray, const double *weight,
+                      int64_t width, double *fixed) {
+  static const int in_x[PLANES - 1] = {0, 1, 0, 1, 2, 0}, in_s[PLANES - 1] = {0, 0, 1, 1, 0, 2};
+  double powers[5] = {0}, by_behind[3] = {0}, by_gray[3] = {0}, both = 0, twice = 0, grays = 0;
+  for (int64_t k = 0; k < width; k++) {
+    double w = weight[k], one = w * x[k], two = one * x[k], three = two * x[k], b = behind[k], g = gray[k];
+    powers[0] += w, powers[1] += one, powers[2] += two, powers[3] += three, powers[4] += three * x[k];
+    by_behind[0] += w * b, by_behind[1] += one * b, by_behind[2] += two * b;
+    by_gray[0] += w * g, by_gray[1] += one * g, by_gray[2] += two * g;
+    twice += w * b * b, both += w * b * g, grays += w * g * g;
+  }
+  const double of_s[5] = {1, s, s * s, s * s * s, s * s * s * s};
+  for (int p = 0; p < PLANES - 1; p++) {
+    for (int q = 0; q <= p; q++) fixed[p * KINDS + q] += of_s[in_s[p] + in_s[q]] * powers[in_x[p] + in_x[q]];
+    fixed[(PLANES - 1) * KINDS + p] += of_s[in_s[p]] * by_behind[in_x[p]];
+    fixed[PLANES * KINDS + p] += of_s[in_s[p]] * by_gray[in_x[p]];
+  }
+  fixed[(PLANES - 1) * KINDS + PLANES - 1] += twice;
+  fixed[PLANES * KINDS + PLANES - 1] += both, fixed[PLANES * KINDS + PLANES] += grays;
+}
+
 /* One view straightened past an end, of rows local_mm (n, 3) in the camera's frame at arc_mm (n,), across (width,).
 
    See `tip._look`: gray, weight (n, width), weighted (n, width, 8), fixed (8, 8), noise_gray; returns the median sine
@@ -443,20 +466,22 @@ EXPORT double tip_picture(const uint8_t *image, int64_t rows, int64_t columns, i
   double mean = 0;
   for (int64_t i = 0; i < n; i++) mean += arc_mm[i] / (double)n;
   double half = (arc_mm[n - 1] - arc_mm[0]) / 2;
-  double sums[8][8] = {{0}};
+  memset(fixed, 0, KINDS * KINDS * sizeof *fixed);
+  double *shown = smooth + plane, *far = shown + plane;
+  for (int64_t k = 0; k < width; k++) far[k] = across[k] / last;
   for (int64_t i = 0; i < n; i++) {
-    double s = (arc_mm[i] - mean) / half;
+    double s = (arc_mm[i] - mean) / half, *darker = smooth + i * width;
     for (int64_t k = 0; k < width; k++) {
       int64_t at = i * width + k;
-      double x = across[k] / last, w = weight[at];
-      double v[8] = {1, x, s, x * s, x * x, s * s, smooth[at] - behind, gray[at] - all};
-      for (int p = 0; p < 8; p++) weighted[8 * at + p] = w * v[p];
-      /* Both halves of the symmetric sums: eight at a time are faster than half as many one by one. */
-      for (int p = 0; p < 8; p++)
-        for (int q = 0; q < 8; q++) sums[p][q] += weighted[8 * at + p] * v[q];
+      double x = far[k], w = weight[at];
+      darker[k] -= behind, shown[k] = gray[at] - all;
+      double v[KINDS] = {1, x, s, x * s, x * x, s * s, darker[k], shown[k]};
+      for (int p = 0; p < KINDS; p++) weighted[KINDS * at + p] = w * v[p];
     }
+    add_fixed(far, s, darker, shown, weight + i * width, width, fixed);
   }
-  memcpy(fixed, sums, sizeof sums);
+  for (int p = 0; p < KINDS; p++)
+    for (int q = 0; q < p; q++) fixed[q * KINDS + p] = fixed[p * KINDS + q];
   return sine;
 }
 

@@ -245,6 +245,22 @@ static void measured(Sight *s, const double *points, const int64_t *first, const
   }
 }
 
+/* Adds the weighted outer products of rows (count, ROW) to the block (ROW, ROW) of a matrix of `size` columns. */
+static void add_squares(const double *rows, const double *weight, int64_t count, double *block, int64_t size) {
+  for (int a = 0; a < ROW; a += 4) {
+    Lanes sums[4][ROW / LANES] = {{{0}}};
+    for (int64_t i = 0; i < count; i++) {
+      const double *row = rows + ROW * i;
+      for (int r = 0; r < 4; r++) {
+        double share = weight[i] * row[a + r];
+        for (int q = 0; q < ROW / LANES; q++) sums[r][q] += share * *(const Lanes *)(row + LANES * q);
+      }
+    }
+    for (int r = 0; r < 4; r++)
+      for (int q = 0; q < ROW / LANES; q++) *(Lanes *)(block + (a + r) * size + LANES * q) += sums[r][q];
+  }
+}
+
 /* One step of Gauss-Newton of the control points (3 m,) from where they are, robust weights settled in rounds.
 
    held, smooth (3 m, 3 m): the priors' matrices. share: of a point of its own in an independent one. normal (3 m, 3 m):
@@ -288,11 +304,14 @@ EXPORT int approach(Sight *sights, int64_t n, int64_t m, const int64_t *first, c
         double scaled = off / (robust_px > sigma ? robust_px : sigma);
         double weight = (i < s->count - s->ends ? share : 1.0) / (sigma * sigma) / (1 + scaled * scaled);
         s->weight[i] = weight;
-        for (int a = 0; a < ROW; a++) {
-          double w = weight * row[a], *mine = normal + (at + a) * size + at;
-          for (int b = 0; b < ROW; b++) mine[b] += w * row[b];
-          target[at + a] += w * s->residual[i];
-        }
+        double pulled = weight * s->residual[i];
+        for (int a = 0; a < ROW; a++) target[at + a] += pulled * row[a];
+      }
+      for (int64_t i = 0, next; i < s->count; i = next) {
+        /* Neighbours mostly concern the same control points. */
+        int64_t at = first[s->index[i]];
+        for (next = i + 1; next < s->count && first[s->index[next]] == at;) next++;
+        add_squares(s->rows + ROW * i, s->weight + i, next - i, normal + 3 * at * (size + 1), size);
       }
     }
     memcpy(step, target, (size_t)size * sizeof *step);

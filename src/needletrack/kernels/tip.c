@@ -349,31 +349,43 @@ static int64_t mirrored(int64_t at, int64_t length) {
   return at;
 }
 
+/* The sum (width,) of rows `taps` (count,), weighted; a few columns at a time, whose sums stay in registers. */
+static void weighed(const double *const *taps, const double *weights, int64_t count, int64_t width, double *out) {
+  int64_t j = 0;
+  for (; j + 4 * LANES <= width; j += 4 * LANES) {
+    Lanes sums[4] = {{0}};
+    for (int64_t k = 0; k < count; k++)
+      for (int q = 0; q < 4; q++) sums[q] += weights[k] * *(const Lanes *)(taps[k] + j + LANES * q);
+    for (int q = 0; q < 4; q++) *(Lanes *)(out + j + LANES * q) = sums[q];
+  }
+  for (; j + LANES <= width; j += LANES) {
+    Lanes sum = {0};
+    for (int64_t k = 0; k < count; k++) sum += weights[k] * *(const Lanes *)(taps[k] + j);
+    *(Lanes *)(out + j) = sum;
+  }
+  for (; j < width; j++) {
+    out[j] = 0;
+    for (int64_t k = 0; k < count; k++) out[j] += weights[k] * taps[k][j];
+  }
+}
+
 /* Gaussian blur (n, width), mirrored at the borders as SciPy's `reflect`, to four sigmas. */
 static void blurred(const double *in, int64_t n, int64_t width, const double *sigma, double *out, double *work) {
+  double padded[width + 62];
   for (int axis = 0; axis < 2; axis++) {
-    const double *from = axis ? work : in;
-    double *to = axis ? out : work, kernel[64], sum = 0;
-    int64_t radius = (int64_t)(4 * sigma[axis] + 0.5), length = axis ? width : n;
-    radius = radius > 31 ? 31 : radius;
-    for (int64_t k = -radius; k <= radius; k++)
-      sum += kernel[k + radius] = exp(-0.5 * (double)(k * k) / (sigma[axis] * sigma[axis]));
-    memset(to, 0, (size_t)(n * width) * sizeof *to);
-    for (int64_t i = 0; i < n; i++)
-      for (int64_t k = -radius; k <= radius; k++) {
-        double share = kernel[k + radius] / sum, *row = to + i * width;
-        if (axis == 0) {
-          const double *other = from + mirrored(i + k, length) * width;
-          for (int64_t j = 0; j < width; j++) row[j] += share * other[j];
-          continue;
-        }
-        const double *other = from + i * width;
-        int64_t first = k < 0 ? -k : 0, last = k > 0 ? width - k : width;
-        first = first < width ? first : width, last = last > first ? last : first;
-        for (int64_t j = 0; j < first; j++) row[j] += share * other[mirrored(j + k, length)];
-        for (int64_t j = first; j < last; j++) row[j] += share * other[j + k];
-        for (int64_t j = last; j < width; j++) row[j] += share * other[mirrored(j + k, length)];
-      }
+    const double *from = axis ? work : in, *taps[63];
+    double *to = axis ? out : work, kernel[63], sum = 0;
+    int64_t radius = (int64_t)(4 * sigma[axis] + 0.5), count;
+    radius = radius > 31 ? 31 : radius, count = 2 * radius + 1;
+    for (int64_t k = 0; k < count; k++)
+      sum += kernel[k] = exp(-0.5 * (double)((k - radius) * (k - radius)) / (sigma[axis] * sigma[axis]));
+    for (int64_t k = 0; k < count; k++) kernel[k] /= sum;
+    for (int64_t i = 0; i < n; i++) {
+      if (axis)
+        for (int64_t j = -radius; j < width + radius; j++) padded[j + radius] = from[i * width + mirrored(j, width)];
+      for (int64_t k = 0; k < count; k++) taps[k] = axis ? padded + k : from + mirrored(i + k - radius, n) * width;
+      weighed(taps, kernel, count, width, to + i * width);
+    }
   }
 }
 

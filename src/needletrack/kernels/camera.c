@@ -3,6 +3,8 @@
 
 #define UNDISTORT_ROUNDS 50
 #define UNDISTORT_UNTIL 1e-15
+/* A whole step of Newton so short leaves about its square. */
+#define LAST_STEP 1e-9
 
 void distorted(const Camera *c, double x, double y, double *px, double *by_ray) {
   double r2 = x * x + y * y, r4 = r2 * r2, r6 = r4 * r2;
@@ -45,7 +47,8 @@ void ray_of(const Camera *c, const double *px, double *ray) {
       if (left < off || off < 1e-20) break;
     }
     x += share * dx, y += share * dy;
-    if (share * share * (dx * dx + dy * dy) < UNDISTORT_UNTIL * UNDISTORT_UNTIL * (1 + x * x + y * y)) break;
+    double until = share < 1 ? UNDISTORT_UNTIL : LAST_STEP;
+    if (share * share * (dx * dx + dy * dy) < until * until * (1 + x * x + y * y)) break;
   }
   ray[0] = x, ray[1] = y;
 }

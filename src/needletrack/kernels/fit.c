@@ -32,49 +32,103 @@ static double dot(const double *a, const double *b, int64_t n) {
   return sum;
 }
 
-/* Lower triangle of the Cholesky factor in place; 1 where the matrix is not positive definite. */
+#define LANES 4
+#define TILE (2 * LANES)
+
+typedef double Lanes __attribute__((vector_size(8 * LANES), aligned(8), may_alias));
+
+/* One tile of `take_away`: columns `at` to at + TILE of four rows, of which those before `from` stay as they are. */
+static inline void take_tile(const double *x, int64_t next, int64_t down, const double *y, int64_t count, double *out,
+                             int64_t columns, int64_t at, int64_t from) {
+  Lanes sums[4][2] = {{{0}}};
+  for (int64_t k = 0; k < count; k++) {
+    const Lanes *row = (const Lanes *)(y + k * columns + at);
+    Lanes left = row[0], right = row[1];
+    for (int r = 0; r < 4; r++) {
+      double share = x[k * next + r * down];
+      sums[r][0] += share * left, sums[r][1] += share * right;
+    }
+  }
+  for (int r = 0; r < 4; r++) {
+    double *mine = out + r * columns + at;
+    if (at == from) {
+      for (int q = 0; q < 2; q++) *(Lanes *)(mine + LANES * q) -= sums[r][q];
+      continue;
+    }
+    for (int64_t k = from - at; k < TILE; k++) mine[k] -= sums[r][k / LANES][k % LANES];
+  }
+}
+
+/* Takes x y from `rows` rows of out, from column `from` on; x (rows, count): its columns are `next` apart and its rows
+   `down`; y (count, columns). Four rows and eight columns of sums stay in registers: what is read serves all of them. */
+static void take_away(const double *x, int64_t next, int64_t down, const double *y, int64_t count, double *out,
+                      int64_t rows, int64_t columns, int64_t from) {
+  int64_t r = 0;
+  for (; r + 4 <= rows && columns >= TILE; r += 4)
+    for (int64_t at = from; at < columns; at += TILE)
+      take_tile(x + r * down, next, down, y, count, out + r * columns, columns,
+                at + TILE <= columns ? at : columns - TILE, at);
+  for (; r < rows; r++)
+    for (int64_t k = 0; k < count; k++) {
+      double share = x[k * next + r * down];
+      for (int64_t j = from; j < columns; j++) out[r * columns + j] -= share * y[k * columns + j];
+    }
+}
+
+/* The Cholesky factor U of U'U, in place of its upper triangle, the diagonal as its inverse; 1 where the matrix is not
+   positive definite. Below the diagonal nothing is read, and what is there has no meaning afterwards. */
 static int factored(double *a, int64_t n) {
-  for (int64_t i = 0; i < n; i++) {
-    double *row = a + i * n;
-    for (int64_t j = 0; j < i; j++) row[j] = (row[j] - dot(row, a + j * n, j)) / a[j * n + j];
-    double rest = row[i] - dot(row, row, i);
-    if (!(rest > 0)) return 1;
-    row[i] = sqrt(rest);
+  for (int64_t first = 0; first < n; first += 4) {
+    int64_t last = first + 4 < n ? first + 4 : n;
+    take_away(a + first, n, 1, a, first, a + first * n, last - first, n, first);
+    for (int64_t i = first; i < last; i++) {
+      double *mine = a + i * n;
+      if (!(mine[i] > 0)) return 1;
+      double over = 1 / sqrt(mine[i]);
+      mine[i] = over;
+      for (int64_t j = i + 1; j < n; j++) mine[j] *= over;
+      for (int64_t next = i + 1; next < last; next++) {
+        double *other = a + next * n, share = mine[next];
+        for (int64_t j = next; j < n; j++) other[j] -= share * mine[j];
+      }
+    }
   }
   return 0;
 }
 
-static void forward(const double *l, int64_t n, double *b) {
-  for (int64_t i = 0; i < n; i++) b[i] = (b[i] - dot(l + i * n, b, i)) / l[i * n + i];
+static void forward(const double *u, int64_t n, double *b) {
+  for (int64_t i = 0; i < n; i++) {
+    double mine = b[i] *= u[i * n + i];
+    for (int64_t j = i + 1; j < n; j++) b[j] -= u[i * n + j] * mine;
+  }
 }
 
-static void backward(const double *l, int64_t n, double *b) {
-  for (int64_t i = n - 1; i >= 0; i--) {
-    b[i] /= l[i * n + i];
-    for (int64_t j = 0; j < i; j++) b[j] -= l[i * n + j] * b[i];
-  }
+static void backward(const double *u, int64_t n, double *b) {
+  for (int64_t i = n - 1; i >= 0; i--)
+    b[i] = (b[i] - dot(u + i * n + i + 1, b + i + 1, n - 1 - i)) * u[i * n + i];
 }
 
 /* The same for right sides (n, r) at once. */
-static void forward_all(const double *l, int64_t n, double *b, int64_t r) {
-  for (int64_t i = 0; i < n; i++) {
-    double *mine = b + i * r, over = 1 / l[i * n + i];
-    for (int64_t j = 0; j < i; j++) {
-      double share = l[i * n + j];
-      const double *other = b + j * r;
-      for (int64_t k = 0; k < r; k++) mine[k] -= share * other[k];
+static void forward_all(const double *u, int64_t n, double *b, int64_t r) {
+  for (int64_t first = 0; first < n; first += 4) {
+    int64_t last = first + 4 < n ? first + 4 : n;
+    take_away(u + first, n, 1, b, first, b + first * r, last - first, r, 0);
+    for (int64_t i = first; i < last; i++) {
+      double *mine = b + i * r;
+      take_away(u + first * n + i, n, 1, b + first * r, i - first, mine, 1, r, 0);
+      for (int64_t k = 0; k < r; k++) mine[k] *= u[i * n + i];
     }
-    for (int64_t k = 0; k < r; k++) mine[k] *= over;
   }
 }
 
-static void backward_all(const double *l, int64_t n, double *b, int64_t r) {
-  for (int64_t i = n - 1; i >= 0; i--) {
-    double *mine = b + i * r, over = 1 / l[i * n + i];
-    for (int64_t k = 0; k < r; k++) mine[k] *= over;
-    for (int64_t j = 0; j < i; j++) {
-      double share = l[i * n + j], *other = b + j * r;
-      for (int64_t k = 0; k < r; k++) other[k] -= share * mine[k];
+static void backward_all(const double *u, int64_t n, double *b, int64_t r) {
+  for (int64_t last = n; last > 0; last -= 4) {
+    int64_t first = last > 4 ? last - 4 : 0;
+    take_away(u + first * n + last, 1, n, b + last * r, n - last, b + first * r, last - first, r, 0);
+    for (int64_t i = last - 1; i >= first; i--) {
+      double *mine = b + i * r;
+      take_away(u + i * n + i + 1, 1, n, b + (i + 1) * r, last - 1 - i, mine, 1, r, 0);
+      for (int64_t k = 0; k < r; k++) mine[k] *= u[i * n + i];
     }
   }
 }
@@ -112,7 +166,7 @@ EXPORT int streak_line(const Sight *s, const double *points, const int64_t *firs
       double alike = dot(along + 3 * i, along + 3 * j, 3), turned = 2 - 2 * alike;
       double apart = 1.7320508075688772 * fabs(at_mm[i] - at_mm[j]) / change_mm;
       double turn = 1.7320508075688772 * sqrt(turned > 0 ? turned : 0);
-      jumping[i * count + j] = expected[i * count + j] =
+      jumping[j * count + i] = expected[j * count + i] =
           scale * (level + slowly * matern(apart) + bending * matern(turn));
     }
     expected[i * count + i] += variance[i];
@@ -191,6 +245,22 @@ static void measured(Sight *s, const double *points, const int64_t *first, const
   }
 }
 
+/* Adds the weighted outer products of rows (count, ROW) to the block (ROW, ROW) of a matrix of `size` columns. */
+static void add_squares(const double *rows, const double *weight, int64_t count, double *block, int64_t size) {
+  for (int a = 0; a < ROW; a += 4) {
+    Lanes sums[4][ROW / LANES] = {{{0}}};
+    for (int64_t i = 0; i < count; i++) {
+      const double *row = rows + ROW * i;
+      for (int r = 0; r < 4; r++) {
+        double share = weight[i] * row[a + r];
+        for (int q = 0; q < ROW / LANES; q++) sums[r][q] += share * *(const Lanes *)(row + LANES * q);
+      }
+    }
+    for (int r = 0; r < 4; r++)
+      for (int q = 0; q < ROW / LANES; q++) *(Lanes *)(block + (a + r) * size + LANES * q) += sums[r][q];
+  }
+}
+
 /* One step of Gauss-Newton of the control points (3 m,) from where they are, robust weights settled in rounds.
 
    held, smooth (3 m, 3 m): the priors' matrices. share: of a point of its own in an independent one. normal (3 m, 3 m):
@@ -234,11 +304,14 @@ EXPORT int approach(Sight *sights, int64_t n, int64_t m, const int64_t *first, c
         double scaled = off / (robust_px > sigma ? robust_px : sigma);
         double weight = (i < s->count - s->ends ? share : 1.0) / (sigma * sigma) / (1 + scaled * scaled);
         s->weight[i] = weight;
-        for (int a = 0; a < ROW; a++) {
-          double w = weight * row[a], *mine = normal + (at + a) * size + at;
-          for (int b = 0; b < ROW; b++) mine[b] += w * row[b];
-          target[at + a] += w * s->residual[i];
-        }
+        double pulled = weight * s->residual[i];
+        for (int a = 0; a < ROW; a++) target[at + a] += pulled * row[a];
+      }
+      for (int64_t i = 0, next; i < s->count; i = next) {
+        /* Neighbours mostly concern the same control points. */
+        int64_t at = first[s->index[i]];
+        for (next = i + 1; next < s->count && first[s->index[next]] == at;) next++;
+        add_squares(s->rows + ROW * i, s->weight + i, next - i, normal + 3 * at * (size + 1), size);
       }
     }
     memcpy(step, target, (size_t)size * sizeof *step);
@@ -290,19 +363,21 @@ EXPORT int fit_covariance(const Sight *sights, int64_t n, int64_t m, const int64
     const Sight *s = sights + v;
     memset(carried, 0, (size_t)size * sizeof *carried);
     double before = 0;
+    int64_t reached = 0;
     for (int64_t i = 0; i < s->count - s->ends; i++) {
       /* Errors alike by exp(-distance) are a Markov chain: what all sections before pull is carried along. */
       double at = length_mm[s->index[i]], fade = i ? exp(-(at - before) / systematic_mm) : 0;
       const double *row = s->rows + ROW * i;
       int64_t here = 3 * first[s->index[i]];
       before = at;
-      for (int64_t k = 0; k < size; k++) carried[k] *= fade;
+      for (int64_t k = 0; k < reached; k++) carried[k] *= fade;
       for (int a = 0; a < ROW; a++) {
         double w = systematic[v] * s->weight[i] * row[a], *mine = pulled + (here + a) * size;
-        for (int64_t k = 0; k < size; k++) mine[k] += w * carried[k];
+        for (int64_t k = 0; k < reached; k++) mine[k] += w * carried[k];
         for (int b = 0; b < ROW; b++) mine[here + b] += w * s->weight[i] * row[b] / 2;
       }
       for (int a = 0; a < ROW; a++) carried[here + a] += s->weight[i] * row[a];
+      reached = here + ROW > reached ? here + ROW : reached;
     }
   }
   /* Each pair was counted once: the other half is its mirror image. */
@@ -310,18 +385,10 @@ EXPORT int fit_covariance(const Sight *sights, int64_t n, int64_t m, const int64
     for (int64_t j = 0; j <= i; j++)
       factor[i * size + j] = factor[j * size + i] = pulled[i * size + j] + pulled[j * size + i];
   memset(pulled, 0, (size_t)(size * size) * sizeof *pulled);
+  take_away(spread, 1, size, factor, size, pulled, size, size, 0);
+  take_away(pulled, 1, size, spread, size, covariance, size, size, 0);
   for (int64_t i = 0; i < size; i++)
-    for (int64_t j = 0; j < size; j++) {
-      double share = spread[i * size + j], *mine = pulled + i * size;
-      const double *other = factor + j * size;
-      for (int64_t k = 0; k < size; k++) mine[k] += share * other[k];
-    }
-  for (int64_t i = 0; i < size; i++)
-    for (int64_t j = 0; j <= i; j++) {
-      double sum = dot(pulled + i * size, spread + j * size, size);
-      covariance[i * size + j] += sum;
-      if (i != j) covariance[j * size + i] += sum;
-    }
+    for (int64_t j = 0; j < i; j++) covariance[i * size + j] = covariance[j * size + i];
   return 0;
 }
 

@@ -53,37 +53,47 @@ typedef struct {
 } Shape;
 
 #define KINDS (PLANES + 1)
+/* What the planes need to know of a part's picture: its sums with 1, x and x^2. */
+#define MOMENTS 3
+#define LANES 4
+
+typedef double Lanes __attribute__((vector_size(8 * LANES), aligned(8), may_alias));
+
+static int64_t whole_lanes(int64_t count) { return (count + LANES - 1) / LANES * LANES; }
 
 /* Adds what one row of the view, which shows row `at` of the pictures, says: by planes and grey, and by itself. */
 static void add_row(const Shape *shape, int64_t at, int64_t parts, const double *weighted, const double *weight,
-                    int is_whole, int64_t width, double *mixed, double *own) {
+                    int64_t width, double *mixed, double *own) {
   const double *inside = shape->pictures + at * parts * width;
   const uint8_t *extent = shape->extent + 2 * at * parts;
-  for (int64_t p = 0; p < parts; p++) {
-    const double *mine = inside + p * width;
-    /* Two sums, for one would wait for itself. */
-    double even[KINDS] = {0}, odd[KINDS] = {0};
-    int64_t k = extent[2 * p], last = extent[2 * p + 1];
-    for (; k + 1 < last; k += 2)
-      for (int q = 0; q < KINDS; q++) {
-        even[q] += mine[k] * weighted[k * KINDS + q];
-        odd[q] += mine[k + 1] * weighted[(k + 1) * KINDS + q];
-      }
-    if (k < last)
-      for (int q = 0; q < KINDS; q++) even[q] += mine[k] * weighted[k * KINDS + q];
-    for (int q = 0; q < KINDS; q++) mixed[p * KINDS + q] += even[q] + odd[q];
-  }
-  if (is_whole) {
-    const double *all = shape->own + at * parts * parts;
-    for (int64_t k = 0; k < parts * parts; k++) own[k] += all[k];
-    return;
-  }
   double part[64];
   for (int64_t p = 0; p < parts; p++) {
+    const double *mine = inside + p * width;
+    for (int64_t k = extent[2 * p]; k < extent[2 * p + 1]; k++)
+      for (int q = 0; q < KINDS; q++) mixed[p * KINDS + q] += mine[k] * weighted[k * KINDS + q];
     if (extent[2 * p] >= extent[2 * p + 1]) continue;
-    for (int64_t k = 0; k < width; k++) part[k] = inside[p * width + k] * weight[k];
+    for (int64_t k = 0; k < width; k++) part[k] = mine[k] * weight[k];
     for (int64_t o = 0; o <= p; o++) own[p * parts + o] += dot(part, inside + o * width, width);
   }
+}
+
+/* Adds to sums (2,), lane by lane, a part's picture (width,) times two rows (2, width), where it shows. */
+static inline void add_shown(const double *picture, const uint8_t *extent, const double *rows, int64_t width,
+                             Lanes *sums) {
+  static const double keep[2 * LANES] = {1, 1, 1, 1};
+  int64_t k = extent[0], last = extent[1];
+  if (k >= last) return;
+  if (k + whole_lanes(last - k) > width) {
+    for (; k < last; k++) sums[0][0] += picture[k] * rows[k], sums[1][0] += picture[k] * rows[width + k];
+    return;
+  }
+  Lanes one = sums[0], other = sums[1];
+  for (; k + LANES < last; k += LANES) {
+    Lanes shown = *(const Lanes *)(picture + k);
+    one += shown * *(const Lanes *)(rows + k), other += shown * *(const Lanes *)(rows + width + k);
+  }
+  Lanes shown = *(const Lanes *)(picture + k) * *(const Lanes *)(keep + LANES - (last - k));
+  sums[0] = one + shown * *(const Lanes *)(rows + k), sums[1] = other + shown * *(const Lanes *)(rows + width + k);
 }
 
 /* The parts' products (distances, parts, parts) in pictures (distances, parts, width), and the columns
@@ -110,7 +120,10 @@ EXPORT void pictures_of(const double *pictures, int64_t distances, int64_t parts
 
    The pictures show each part of the inside at distances before_mm + picture_mm * (0 ... s - 1) before the apex; before
    and beyond all is as in the outermost. sums (n + 1, each): over the rows from `first` on of what shows the shaft, which
-   far from the apex all rows do, as many of them as were asked for so far. */
+   far from the apex all rows do, as many of them as were asked for so far.
+
+   Of a whole row, whose weights are all 1, only what lies behind and the grey differ from pixel to pixel, varying
+   (n, 2, width): the planes' sums are moments (distances, MOMENTS, parts) of the picture times powers of along (n,). */
 typedef struct {
   const TipView *view;
   const double *arc_mm;
@@ -119,7 +132,7 @@ typedef struct {
   Shape shape;
   int64_t s;
   double before_mm;
-  double *sums;
+  double *sums, *varying, *along, *across, *moments;
   uint8_t *whole;
 } Tried;
 
@@ -127,18 +140,107 @@ static int64_t row_of(const Tried *t, double at_mm, int64_t r) {
   return (int64_t)rint((at_mm - t->arc_mm[r] - t->before_mm) / t->picture_mm);
 }
 
+/* Takes apart what whole rows say: across (width,) is x of any of them. */
+static void take_apart(Tried *t) {
+  for (int64_t r = 0; r < t->n; r++) {
+    const double *weight = t->view->weight + r * t->width, *weighted = t->view->weighted + r * t->width * KINDS;
+    t->whole[r] = 1;
+    for (int64_t k = 0; k < t->width; k++) t->whole[r] &= weight[k] == 1;
+    if (!t->whole[r]) continue;
+    t->along[r] = weighted[2];
+    double *varying = t->varying + 2 * r * t->width;
+    for (int64_t k = 0; k < t->width; k++) {
+      t->across[k] = weighted[k * KINDS + 1];
+      varying[k] = weighted[k * KINDS + 6], varying[t->width + k] = weighted[k * KINDS + 7];
+    }
+  }
+}
+
+static void take_moments(Tried *t) {
+  int64_t parts = t->view->parts, stride = whole_lanes(parts);
+  for (int64_t i = 0; i < t->s; i++)
+    for (int64_t p = 0; p < parts; p++) {
+      const double *picture = t->shape.pictures + (i * parts + p) * t->width;
+      const uint8_t *extent = t->shape.extent + 2 * (i * parts + p);
+      double sums[MOMENTS] = {0};
+      for (int64_t k = extent[0]; k < extent[1]; k++) {
+        double x = t->across[k];
+        sums[0] += picture[k], sums[1] += picture[k] * x, sums[2] += picture[k] * x * x;
+      }
+      for (int j = 0; j < MOMENTS; j++) t->moments[(i * MOMENTS + j) * stride + p] = sums[j];
+    }
+}
+
+/* Adds the planes' sums over whole rows, each of which shows a row `at` of the pictures, to mixed (parts, KINDS). */
+static void add_planes(const Tried *t, const int64_t *rows, const int64_t *at, int64_t count, double *mixed) {
+  int64_t parts = t->view->parts, stride = whole_lanes(parts);
+  for (int64_t first = 0; first < parts; first += LANES) {
+    Lanes sums[PLANES - 1] = {{0}};
+    for (int64_t i = 0; i < count; i++) {
+      const double *moments = t->moments + at[i] * MOMENTS * stride + first;
+      Lanes once = *(const Lanes *)moments, by_x = *(const Lanes *)(moments + stride);
+      double s = t->along[rows[i]];
+      sums[0] += once, sums[1] += by_x, sums[2] += once * s, sums[3] += by_x * s;
+      sums[4] += *(const Lanes *)(moments + 2 * stride), sums[5] += once * (s * s);
+    }
+    for (int64_t p = first; p < parts && p < first + LANES; p++)
+      for (int q = 0; q < PLANES - 1; q++) mixed[p * KINDS + q] += sums[q][p - first];
+  }
+}
+
+/* Adds the parts' products in rows `at` of the pictures to own (total,). */
+static void add_products(const double *products, int64_t total, const int64_t *at, int64_t count, double *own) {
+  int64_t k = 0;
+  for (; k + 4 * LANES <= total; k += 4 * LANES) {
+    Lanes sums[4] = {{0}};
+    for (int64_t i = 0; i < count; i++)
+      for (int q = 0; q < 4; q++) sums[q] += *(const Lanes *)(products + at[i] * total + k + LANES * q);
+    for (int q = 0; q < 4; q++) *(Lanes *)(own + k + LANES * q) += sums[q];
+  }
+  for (int64_t i = 0; i < count; i++)
+    for (int64_t j = k; j < total; j++) own[j] += products[at[i] * total + j];
+}
+
+/* Adds what rows (count,) say, each of which shows a row `at` of the pictures, to sums (each,); whole rows, which nearly
+   all are, together. rows and at are used up. */
+static void add_rows(const Tried *t, int64_t *rows, int64_t *at, int64_t count, double *sums) {
+  int64_t parts = t->view->parts, whole = 0;
+  double *mixed = sums, *own = sums + parts * KINDS;
+  Lanes varying[2 * MOST];
+  for (int64_t p = 0; p < 2 * parts; p++) varying[p] = (Lanes){0};
+  for (int64_t i = 0; i < count; i++) {
+    int64_t r = rows[i];
+    if (!t->whole[r]) {
+      add_row(&t->shape, at[i], parts, t->view->weighted + r * t->width * KINDS, t->view->weight + r * t->width,
+              t->width, mixed, own);
+      continue;
+    }
+    rows[whole] = r, at[whole] = at[i];
+    const double *picture = t->shape.pictures + at[whole] * parts * t->width;
+    const uint8_t *extent = t->shape.extent + 2 * at[whole++] * parts;
+    for (int64_t p = 0; p < parts; p++)
+      add_shown(picture + p * t->width, extent + 2 * p, t->varying + 2 * r * t->width, t->width, varying + 2 * p);
+  }
+  for (int64_t p = 0; p < parts; p++)
+    for (int q = 0; q < 2; q++) {
+      Lanes sum = varying[2 * p + q];
+      mixed[p * KINDS + PLANES - 1 + q] += (sum[0] + sum[1]) + (sum[2] + sum[3]);
+    }
+  add_planes(t, rows, at, whole, mixed);
+  add_products(t->shape.own, parts * parts, at, whole, own);
+}
+
 /* Another shape is tried, whose apexes are not before lowest_mm. */
 static void try_shape(Tried *t, int64_t shape, double lowest_mm) {
   t->shape = (Shape){t->view->pictures[shape], t->view->own[shape], t->view->extent[shape]};
   t->s = t->view->distances[shape], t->before_mm = t->view->before_mm[shape];
+  take_moments(t);
   memset(t->sums, 0, (size_t)t->each * sizeof *t->sums);
+  int64_t rows[t->n], at[t->n];
   t->first = 0;
-  double *into = t->sums;
-  while (t->first < t->n && row_of(t, lowest_mm, t->first) >= t->s - 1) {
-    int64_t r = t->first++;
-    add_row(&t->shape, t->s - 1, t->view->parts, t->view->weighted + r * t->width * KINDS,
-            t->view->weight + r * t->width, t->whole[r], t->width, into, into + t->view->parts * KINDS);
-  }
+  while (t->first < t->n && row_of(t, lowest_mm, t->first) >= t->s - 1)
+    rows[t->first] = t->first, at[t->first++] = t->s - 1;
+  add_rows(t, rows, at, t->first, t->sums);
   t->summed = t->first;
 }
 
@@ -155,53 +257,89 @@ static const double *shaft_of(Tried *t, double at_mm, int64_t *rows, double *non
   }
   for (; t->summed < r; t->summed++) {
     double *sums = t->sums + (t->summed + 1 - t->first) * t->each;
+    int64_t row = t->summed, at = t->s - 1;
     memcpy(sums, sums - t->each, (size_t)t->each * sizeof *sums);
-    add_row(&t->shape, t->s - 1, t->view->parts, t->view->weighted + t->summed * t->width * KINDS,
-            t->view->weight + t->summed * t->width, t->whole[t->summed], t->width, sums, sums + t->view->parts * KINDS);
+    add_rows(t, &row, &at, 1, sums);
   }
   return t->sums + (r - t->first) * t->each;
+}
+
+/* What all rows say of an apex, (each,): see `Shape`. */
+static void sums_of(Tried *t, double at_mm, double *sums) {
+  int64_t r, count = 0, rows[t->n], at[t->n];
+  const double *shaft = shaft_of(t, at_mm, &r, sums);
+  if (shaft != sums) memcpy(sums, shaft, (size_t)t->each * sizeof *sums);
+  for (; r < t->n; r++) {
+    int64_t row = row_of(t, at_mm, r);
+    if (row < 0) break; /* Nothing of it shows from here on. */
+    rows[count] = r, at[count++] = row < t->s ? row : t->s - 1;
+  }
+  add_rows(t, rows, at, count, sums);
+}
+
+/* The lower triangle (size + 1, size + 1) of one lane's normal matrix of planes and parts, bordered by their products
+   with the grey and the grey's own. */
+static void bordered(const double *fixed, const double *sums, int64_t parts, const double *prior, int64_t lane,
+                     double *normal) {
+  int64_t size = PLANES + parts, row = (size + 1) * LANES;
+  const double *own = sums + parts * KINDS;
+  double *border = normal + size * row + lane;
+  for (int64_t i = 0; i < PLANES; i++) {
+    for (int64_t j = 0; j <= i; j++) normal[i * row + j * LANES + lane] = fixed[i * KINDS + j] + prior[i * size + j];
+    border[i * LANES] = fixed[i * KINDS + PLANES];
+  }
+  for (int64_t p = 0; p < parts; p++) {
+    double *mine = normal + (PLANES + p) * row + lane;
+    const double *mixed = sums + p * KINDS, *known = prior + (PLANES + p) * size;
+    for (int64_t j = 0; j < PLANES; j++) mine[j * LANES] = mixed[j] + known[j];
+    for (int64_t o = 0; o <= p; o++) mine[(PLANES + o) * LANES] = own[p * parts + o] + known[PLANES + o];
+    border[(PLANES + p) * LANES] = mixed[PLANES];
+  }
+  border[size * LANES] = fixed[PLANES * KINDS + PLANES];
+}
+
+/* Eliminates all but the border of as many matrices (size + 1, size + 1) as there are lanes (Cholesky): what is left of
+   its diagonal is the squared grey left over. log_determinant (LANES,). Returns 1 where one is not positive definite. */
+static int eliminated(Lanes *normal, int64_t size, double *log_determinant) {
+  Lanes column[PLANES + MOST + 1], determinant = (Lanes){0} + 1;
+  for (int l = 0; l < LANES; l++) log_determinant[l] = 0;
+  for (int64_t j = 0; j < size; j++) {
+    Lanes pivot = normal[j * (size + 1) + j], over = 1 / pivot;
+    determinant *= pivot;
+    for (int l = 0; l < LANES; l++) {
+      if (!(pivot[l] > 0)) return 1;
+      if (determinant[l] > 1e200 || determinant[l] < 1e-200)
+        log_determinant[l] += log(determinant[l]), determinant[l] = 1;
+    }
+    for (int64_t i = j + 1; i <= size; i++) {
+      Lanes *mine = normal + i * (size + 1);
+      column[i] = mine[j];
+      Lanes share = mine[j] * over;
+      for (int64_t k = j + 1; k <= i; k++) mine[k] -= share * column[k];
+    }
+  }
+  for (int l = 0; l < LANES; l++) log_determinant[l] += log(determinant[l]);
+  return 0;
 }
 
 /* For apexes at_mm (apexes,): squared greys left over, and the log determinant of what the parts could show.
 
    prior: (7 + parts,)^2. Returns 1 where it fails. */
 static int misfits(Tried *t, const double *at_mm, int64_t apexes, const double *prior, double *out) {
-  int64_t parts = t->view->parts, size = PLANES + parts, n = t->n, each = t->each;
-  const double *fixed = t->view->fixed;
-  for (int64_t a = 0; a < apexes; a++) {
-    double sums[MOST * (PLANES + 1 + MOST)], normal[(PLANES + MOST) * (PLANES + MOST)], target[PLANES + MOST];
-    int64_t r;
-    const double *shaft = shaft_of(t, at_mm[a], &r, sums);
-    if (shaft != sums) memcpy(sums, shaft, (size_t)each * sizeof *sums);
-    for (; r < n; r++) {
-      int64_t row = row_of(t, at_mm[a], r);
-      if (row < 0) break; /* Nothing of it shows from here on. */
-      add_row(&t->shape, row < t->s ? row : t->s - 1, parts, t->view->weighted + r * t->width * KINDS,
-              t->view->weight + r * t->width, t->whole[r], t->width, sums, sums + parts * KINDS);
+  int64_t parts = t->view->parts, size = PLANES + parts;
+  Lanes normal[(size + 1) * (size + 1)];
+  double sums[t->each], log_determinant[LANES];
+  for (int64_t first = 0; first < apexes; first += LANES) {
+    for (int64_t l = 0; l < LANES; l++) {
+      /* Lanes for which there is no apex are as the last that has one. */
+      if (first + l < apexes) sums_of(t, at_mm[first + l], sums);
+      bordered(t->view->fixed, sums, parts, prior, l, (double *)normal);
     }
-    const double *own = sums + parts * (PLANES + 1);
-    for (int64_t i = 0; i < size; i++) {
-      for (int64_t j = 0; j <= i; j++) {
-        double value = i < PLANES ? fixed[i * (PLANES + 1) + j]
-                       : j < PLANES ? sums[(i - PLANES) * (PLANES + 1) + j] : own[(i - PLANES) * parts + j - PLANES];
-        normal[i * size + j] = value + prior[i * size + j];
-      }
-      target[i] = i < PLANES ? fixed[i * (PLANES + 1) + PLANES] : sums[(i - PLANES) * (PLANES + 1) + PLANES];
+    if (eliminated(normal, size, log_determinant)) return 1;
+    for (int64_t l = 0; l < LANES && first + l < apexes; l++) {
+      out[2 * (first + l)] = normal[size * (size + 1) + size][l];
+      out[2 * (first + l) + 1] = log_determinant[l];
     }
-    double determinant = 1, log_determinant = 0;
-    for (int64_t i = 0; i < size; i++) {
-      double *mine = normal + i * size;
-      for (int64_t j = 0; j < i; j++) mine[j] = (mine[j] - dot(mine, normal + j * size, j)) * normal[j * size + j];
-      double rest = mine[i] - dot(mine, mine, i);
-      if (!(rest > 0)) return 1;
-      determinant *= rest;
-      if (determinant > 1e200 || determinant < 1e-200) log_determinant += log(determinant), determinant = 1;
-      /* The diagonal is kept as its inverse. */
-      mine[i] = 1 / sqrt(rest);
-      target[i] = (target[i] - dot(mine, target, i)) * mine[i];
-    }
-    out[2 * a] = fixed[PLANES * (PLANES + 1) + PLANES] - dot(target, target, size);
-    out[2 * a + 1] = log_determinant + log(determinant);
   }
   return 0;
 }
@@ -211,31 +349,43 @@ static int64_t mirrored(int64_t at, int64_t length) {
   return at;
 }
 
+/* The sum (width,) of rows `taps` (count,), weighted; a few columns at a time, whose sums stay in registers. */
+static void weighed(const double *const *taps, const double *weights, int64_t count, int64_t width, double *out) {
+  int64_t j = 0;
+  for (; j + 4 * LANES <= width; j += 4 * LANES) {
+    Lanes sums[4] = {{0}};
+    for (int64_t k = 0; k < count; k++)
+      for (int q = 0; q < 4; q++) sums[q] += weights[k] * *(const Lanes *)(taps[k] + j + LANES * q);
+    for (int q = 0; q < 4; q++) *(Lanes *)(out + j + LANES * q) = sums[q];
+  }
+  for (; j + LANES <= width; j += LANES) {
+    Lanes sum = {0};
+    for (int64_t k = 0; k < count; k++) sum += weights[k] * *(const Lanes *)(taps[k] + j);
+    *(Lanes *)(out + j) = sum;
+  }
+  for (; j < width; j++) {
+    out[j] = 0;
+    for (int64_t k = 0; k < count; k++) out[j] += weights[k] * taps[k][j];
+  }
+}
+
 /* Gaussian blur (n, width), mirrored at the borders as SciPy's `reflect`, to four sigmas. */
 static void blurred(const double *in, int64_t n, int64_t width, const double *sigma, double *out, double *work) {
+  double padded[width + 62];
   for (int axis = 0; axis < 2; axis++) {
-    const double *from = axis ? work : in;
-    double *to = axis ? out : work, kernel[64], sum = 0;
-    int64_t radius = (int64_t)(4 * sigma[axis] + 0.5), length = axis ? width : n;
-    radius = radius > 31 ? 31 : radius;
-    for (int64_t k = -radius; k <= radius; k++)
-      sum += kernel[k + radius] = exp(-0.5 * (double)(k * k) / (sigma[axis] * sigma[axis]));
-    memset(to, 0, (size_t)(n * width) * sizeof *to);
-    for (int64_t i = 0; i < n; i++)
-      for (int64_t k = -radius; k <= radius; k++) {
-        double share = kernel[k + radius] / sum, *row = to + i * width;
-        if (axis == 0) {
-          const double *other = from + mirrored(i + k, length) * width;
-          for (int64_t j = 0; j < width; j++) row[j] += share * other[j];
-          continue;
-        }
-        const double *other = from + i * width;
-        int64_t first = k < 0 ? -k : 0, last = k > 0 ? width - k : width;
-        first = first < width ? first : width, last = last > first ? last : first;
-        for (int64_t j = 0; j < first; j++) row[j] += share * other[mirrored(j + k, length)];
-        for (int64_t j = first; j < last; j++) row[j] += share * other[j + k];
-        for (int64_t j = last; j < width; j++) row[j] += share * other[mirrored(j + k, length)];
-      }
+    const double *from = axis ? work : in, *taps[63];
+    double *to = axis ? out : work, kernel[63], sum = 0;
+    int64_t radius = (int64_t)(4 * sigma[axis] + 0.5), count;
+    radius = radius > 31 ? 31 : radius, count = 2 * radius + 1;
+    for (int64_t k = 0; k < count; k++)
+      sum += kernel[k] = exp(-0.5 * (double)((k - radius) * (k - radius)) / (sigma[axis] * sigma[axis]));
+    for (int64_t k = 0; k < count; k++) kernel[k] /= sum;
+    for (int64_t i = 0; i < n; i++) {
+      if (axis)
+        for (int64_t j = -radius; j < width + radius; j++) padded[j + radius] = from[i * width + mirrored(j, width)];
+      for (int64_t k = 0; k < count; k++) taps[k] = axis ? padded + k : from + mirrored(i + k - radius, n) * width;
+      weighed(taps, kernel, count, width, to + i * width);
+    }
   }
 }
 
@@ -251,6 +401,29 @@ static double median_of(const double *v, int64_t n, double *work) {
   for (int64_t i = 0; i < n; i++) copy[i] = (float)v[i];
   double high = selected(copy, n, n / 2);
   return n % 2 ? high : (high + selected(copy, n, n / 2 - 1)) / 2;
+}
+
+/* Adds to the lower triangle of fixed (8, 8) the products of one row's kinds, weighted: along a row s is the same, so of
+   the planes only the powers of x (width,) are to be summed. behind, gray (width,). */
+static void add_fixed(const double *x, double s, const double *behind, const double *gray, const double *weight,
+                      int64_t width, double *fixed) {
+  static const int in_x[PLANES - 1] = {0, 1, 0, 1, 2, 0}, in_s[PLANES - 1] = {0, 0, 1, 1, 0, 2};
+  double powers[5] = {0}, by_behind[3] = {0}, by_gray[3] = {0}, both = 0, twice = 0, grays = 0;
+  for (int64_t k = 0; k < width; k++) {
+    double w = weight[k], one = w * x[k], two = one * x[k], three = two * x[k], b = behind[k], g = gray[k];
+    powers[0] += w, powers[1] += one, powers[2] += two, powers[3] += three, powers[4] += three * x[k];
+    by_behind[0] += w * b, by_behind[1] += one * b, by_behind[2] += two * b;
+    by_gray[0] += w * g, by_gray[1] += one * g, by_gray[2] += two * g;
+    twice += w * b * b, both += w * b * g, grays += w * g * g;
+  }
+  const double of_s[5] = {1, s, s * s, s * s * s, s * s * s * s};
+  for (int p = 0; p < PLANES - 1; p++) {
+    for (int q = 0; q <= p; q++) fixed[p * KINDS + q] += of_s[in_s[p] + in_s[q]] * powers[in_x[p] + in_x[q]];
+    fixed[(PLANES - 1) * KINDS + p] += of_s[in_s[p]] * by_behind[in_x[p]];
+    fixed[PLANES * KINDS + p] += of_s[in_s[p]] * by_gray[in_x[p]];
+  }
+  fixed[(PLANES - 1) * KINDS + PLANES - 1] += twice;
+  fixed[PLANES * KINDS + PLANES - 1] += both, fixed[PLANES * KINDS + PLANES] += grays;
 }
 
 /* One view straightened past an end, of rows local_mm (n, 3) in the camera's frame at arc_mm (n,), across (width,).
@@ -305,20 +478,22 @@ EXPORT double tip_picture(const uint8_t *image, int64_t rows, int64_t columns, i
   double mean = 0;
   for (int64_t i = 0; i < n; i++) mean += arc_mm[i] / (double)n;
   double half = (arc_mm[n - 1] - arc_mm[0]) / 2;
-  double sums[8][8] = {{0}};
+  memset(fixed, 0, KINDS * KINDS * sizeof *fixed);
+  double *shown = smooth + plane, *far = shown + plane;
+  for (int64_t k = 0; k < width; k++) far[k] = across[k] / last;
   for (int64_t i = 0; i < n; i++) {
-    double s = (arc_mm[i] - mean) / half;
+    double s = (arc_mm[i] - mean) / half, *darker = smooth + i * width;
     for (int64_t k = 0; k < width; k++) {
       int64_t at = i * width + k;
-      double x = across[k] / last, w = weight[at];
-      double v[8] = {1, x, s, x * s, x * x, s * s, smooth[at] - behind, gray[at] - all};
-      for (int p = 0; p < 8; p++) weighted[8 * at + p] = w * v[p];
-      /* Both halves of the symmetric sums: eight at a time are faster than half as many one by one. */
-      for (int p = 0; p < 8; p++)
-        for (int q = 0; q < 8; q++) sums[p][q] += weighted[8 * at + p] * v[q];
+      double x = far[k], w = weight[at];
+      darker[k] -= behind, shown[k] = gray[at] - all;
+      double v[KINDS] = {1, x, s, x * s, x * x, s * s, darker[k], shown[k]};
+      for (int p = 0; p < KINDS; p++) weighted[KINDS * at + p] = w * v[p];
     }
+    add_fixed(far, s, darker, shown, weight + i * width, width, fixed);
   }
-  memcpy(fixed, sums, sizeof sums);
+  for (int p = 0; p < KINDS; p++)
+    for (int q = 0; q < p; q++) fixed[q * KINDS + p] = fixed[p * KINDS + q];
   return sine;
 }
 
@@ -380,7 +555,14 @@ EXPORT int find_tip(const TipView *views, int64_t shapes, const double *arc_mm, 
           fine = 2 * (int64_t)floor(rules[4] / rules[3] + 0.5) + 1;
   if (tries > MOST_PLACES || fine > MOST_PLACES || shapes > MOST_SHAPES) return 1;
   for (int64_t k = 0; k < tries; k++) coarse[k] = end_mm + rules[0] + rules[2] * (double)k;
-  double *scaled[2], log_priors[2];
+  int64_t distances = 0;
+  for (int v = 0; v < 2; v++)
+    for (int64_t k = 0; k < shapes; k++)
+      distances = views[v].distances[k] > distances ? views[v].distances[k] : distances;
+  double varying[2][2 * n * width], along[2][n], across[2][width];
+  double moments[2][distances * MOMENTS * whole_lanes(views[0].parts)], *scaled[2], log_priors[2];
+  memset(across, 0, sizeof across);
+  memset(moments, 0, sizeof moments);
   Tried tried[2];
   for (int v = 0; v < 2; v++) {
     int64_t size = PLANES + views[v].parts;
@@ -398,10 +580,8 @@ EXPORT int find_tip(const TipView *views, int64_t shapes, const double *arc_mm, 
     *t = (Tried){.view = views + v, .arc_mm = arc_mm, .n = n, .width = width, .each = each, .picture_mm = picture_mm};
     t->sums = work, work += (n + 1) * each;
     t->whole = (uint8_t *)work, work += n / 8 + 1;
-    for (int64_t r = 0; r < n; r++) {
-      t->whole[r] = 1;
-      for (int64_t k = 0; k < width; k++) t->whole[r] &= views[v].weight[r * width + k] == 1;
-    }
+    t->varying = varying[v], t->along = along[v], t->across = across[v], t->moments = moments[v];
+    take_apart(t);
   }
   double foreseen = end_mm + rules[8];
   for (int64_t shape = 0; shape < shapes; shape++) {
@@ -431,7 +611,8 @@ EXPORT int find_tip(const TipView *views, int64_t shapes, const double *arc_mm, 
       double least = INFINITY;
       for (int64_t k = 0; k < tries; k++) {
         double off = (coarse[k] - foreseen) / rules[9], value = both[shape][k] + 0.5 * off * off;
-        if (value < least) least = value, best = k;
+        /* Each view may prefer a neighbour of its own: then both are as good, and rounding has no say. */
+        if (value < least - 1e-9) least = value, best = k;
       }
       for (int64_t k = 0; k < fine; k++)
         near[shape][k] = coarse[best] + rules[3] * ((double)k - (double)(fine - 1) / 2);

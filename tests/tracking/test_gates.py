@@ -157,6 +157,13 @@ def test_a_tip_that_hangs_by_nothing_is_none() -> None:
     assert reasons(shape=replace(curve(), seen=seen)) == (Reason.TIP_NOT_SEEN,)
 
 
+def test_an_end_that_hardly_stands_out_has_to_be_agreed_upon_better() -> None:
+    contrast = (99.0, 1.01 * GATES.min_tip_contrast)
+    for share, found in ((0.65, ()), (0.7, (Reason.TIP_DISAGREES,))):
+        apart = (60.0, 60.0 - share * GATES.max_tip_disagreement_mm)
+        assert reasons(with_tip(each_mm=apart, contrast=contrast)) == found
+
+
 def test_a_few_uncertain_points_are_allowed() -> None:
     n = len(curve().points_mm)
     sigma_mm = np.full(n, 0.05)

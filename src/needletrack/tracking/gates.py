@@ -11,10 +11,13 @@ from needletrack.records import Float, NeedleCurve, NeedleTrack, Quality, Reason
 from needletrack.tracking.match import inside
 from needletrack.tracking.needle import Needle, Positive, Workspace
 from needletrack.tracking.refine import Refined
+from needletrack.tracking.tip import TipFit
 
 # Saturation widens a bright needle by up to this much, mm.
 _SATURATION_MM = 0.35
 _BEFORE_TIP_MM = 10.0
+# An end stands out clearly where it does by so many times the least contrast.
+_CLEARLY = 1.5
 
 
 class GateParameters(BaseModel):
@@ -96,7 +99,7 @@ def weaknesses(
         Reason.TIP_NOT_SEEN: min(tip.contrast) < parameters.min_tip_contrast
         or not refined.tip_is_free
         or _seen_before_tip(curve) < parameters.min_tip_seen_share,
-        Reason.TIP_DISAGREES: abs(tip.each_mm[0] - tip.each_mm[1]) > parameters.max_tip_disagreement_mm
+        Reason.TIP_DISAGREES: abs(tip.each_mm[0] - tip.each_mm[1]) > _most_disagreement_mm(tip, parameters)
         or (quality.epipolar_rms_px or 0.0) > parameters.max_tip_epipolar_px,
         Reason.JUMP: previous is not None
         and previous.status is Status.OK
@@ -107,6 +110,12 @@ def weaknesses(
         if found[reason]:
             raise NeedleNotFound("gates", reason)
     return tuple(reason for reason in Reason if found.get(reason, False))
+
+
+def _most_disagreement_mm(tip: TipFit, parameters: GateParameters) -> float:
+    """How far apart both views may place an end: what hardly stands out has to agree better."""
+    stands_out = min(tip.contrast) / (_CLEARLY * parameters.min_tip_contrast)
+    return parameters.max_tip_disagreement_mm * min(1.0, stands_out)
 
 
 def _seen_before_tip(curve: NeedleCurve) -> float:

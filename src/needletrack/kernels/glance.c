@@ -16,7 +16,7 @@ typedef struct {
   double advance_mm, taper_mm, since_s;
   /* Whether it is looked for roughly first: with fewer sections, on a coarser grid, without its tip. */
   int64_t roughly_first;
-  Axis rough, near;
+  Axis rough;
   double rough_section_mm;
   /* Its end is elsewhere where sections of so long a stretch say so, by so much each. */
   double end_mm, elsewhere_gain;
@@ -462,7 +462,6 @@ static int settled(const Call *call, int64_t most_looks) {
         memcpy(line, rough, (size_t)(3 * count) * sizeof *line);
         lengths(line, count, arc);
         now.before_mm = line, now.before = count, now.advance_mm = 0, now.foreseen_off_mm = foreseen - arc[count - 1];
-        now.axis = now.near;
       }
       if (answer != NO_MEMORY) give_back(mark);
     }

@@ -19,7 +19,7 @@ from needletrack.geometry.spline import arc_length
 from needletrack.geometry.stereo import StereoRig
 from needletrack.kernels import address, call, two_tip_views
 from needletrack.records import Appearance, Float, Image, Reason
-from needletrack.tracking.adjust import MOVED, Expectation, Looks
+from needletrack.tracking.adjust import Expectation, Looks
 from needletrack.tracking.axis import (
     FOUND,
     MOST_CONTROL,
@@ -222,7 +222,6 @@ class _Glance(ctypes.Structure):
         ("since_s", D),
         ("roughly_first", I),
         ("rough", Axis),
-        ("near", Axis),
         ("rough_section_mm", D),
         ("end_mm", D),
         ("elsewhere_gain", D),
@@ -355,8 +354,8 @@ def _axis(needle: Needle, looks: Looks, appearance: Appearance, kept: Kept) -> A
 def _wanted(parameters: GlanceParameters, appearance: Appearance) -> tuple[_Glance, Kept]:
     """What does not change from pair to pair; and the arrays that it points to."""
     needle, kept = parameters.needle, Kept()
-    axis, rough, near = (_axis(needle, looks, appearance, kept) for looks in (MOVED, _ROUGHLY, _NEARLY))
-    axis.rows_per_section = near.rows_per_section = round(_SECTION_SHARE * ROWS_PER_SECTION)
+    axis, rough = (_axis(needle, looks, appearance, kept) for looks in (_NEARLY, _ROUGHLY))
+    axis.rows_per_section = round(_SECTION_SHARE * ROWS_PER_SECTION)
     spline = spline_of(parameters.fit, kept)
     spline.systematic_px = parameters.fit.systematic_px[appearance.inside]
     prior, log_prior = prior_of_parts()
@@ -364,7 +363,6 @@ def _wanted(parameters: GlanceParameters, appearance: Appearance) -> tuple[_Glan
         axis=axis,
         spline=spline,
         rough=rough,
-        near=near,
         rough_section_mm=_ROUGH_SECTION_MM,
         end_mm=_END_MM,
         elsewhere_gain=_ELSEWHERE_GAIN,

@@ -5,16 +5,18 @@ from functools import cache
 
 import numpy as np
 import pytest
-from tests.tracking.scenes import ARC, RIG, WORLDS, Scene, scene, seen_at, tracked
+from tests.tracking.scenes import ARC, RIG, WORLDS, Scene, drawn_at_random, scene, seen_at, tracked
 
 from needletrack.errors import NeedleNotFound
 from needletrack.geometry import spline
 from needletrack.geometry.spline import distance_from_curve
 from needletrack.records import Frame, NeedleTrack, Reason, Status, StereoPair
 from needletrack.scoring import TrueShape, score
+from needletrack.synthetic.needle import Wave
+from needletrack.synthetic.world import World
 from needletrack.tracking.glance import MOST_LOOKS, SETTLED_MM, Glance, GlanceParameters, Steady, glance
 from needletrack.tracking.parameters import TrackingParameters
-from needletrack.tracking.track import follow
+from needletrack.tracking.track import follow, track_pair
 
 P = TrackingParameters()
 PARAMETERS = GlanceParameters(P.needle, P.fit, P.ends, P.tip, P.beside, P.refine.spacing_mm)
@@ -119,33 +121,47 @@ def test_a_curve_behind_the_cameras_is_refused() -> None:
 FAR_MM = (0.5, 0.0, 0.2)
 
 
+@pytest.mark.parametrize("aside_mm", [0.5, 0.8, 1.2])
+def test_what_moved_all_at_once_is_found_at_one_look(aside_mm: float) -> None:
+    moved = replace(ARC, shift_mm=(Wave(aside_mm), Wave(0.0), Wave(0.0)))
+    shown = seen_at(replace(WORLDS["dark"], needle=moved), STEP_S)
+    found = glance(shown.images, RIG, steady(tracked("dark")), PARAMETERS)
+    assert found is not None
+    assert (found.looks, found.aside_mm < SETTLED_MM) == (1, True)
+    assert np.median(distance_from_curve(found.fit.points_mm, shown.truth.centerline_mm)) < 0.03
+
+
 @cache
-def far_away() -> Scene:
-    base_mm = (np.array(ARC.base_mm) + FAR_MM).tolist()
-    return seen_at(replace(WORLDS["dark"], needle=replace(ARC, base_mm=tuple(base_mm))), STEP_S)
+def swung() -> tuple[World, Scene, Steady]:
+    """A needle whose tip swings by 2.5 mm, which is not seen whole at one look; and what was known of it before."""
+    world = drawn_at_random(4)
+    before = track_pair(seen_at(world).pair, world.rig)
+    return world, seen_at(world, 1 / 30), steady(before, since_s=1 / 30, is_moving=True)
 
 
-def test_what_has_moved_far_is_looked_at_until_it_stays() -> None:
-    shown, before = far_away(), steady(tracked("dark"))
-    once = glance(shown.images, RIG, before, PARAMETERS, most_looks=1)
-    found = glance(shown.images, RIG, before, PARAMETERS)
+def test_what_has_swung_far_is_looked_at_until_it_stays() -> None:
+    world, shown, before = swung()
+    once = glance(shown.images, world.rig, before, PARAMETERS, most_looks=1)
+    found = glance(shown.images, world.rig, before, PARAMETERS)
     assert once is not None
     assert found is not None
     assert (once.looks, once.aside_mm > SETTLED_MM) == (1, True)
     assert 1 < found.looks <= MOST_LOOKS
     assert found.aside_mm < SETTLED_MM
-    errors_mm = [np.median(distance_from_curve(g.fit.points_mm, shown.truth.centerline_mm)) for g in (once, found)]
-    assert errors_mm[1] < 0.03
-    assert errors_mm[1] < errors_mm[0]
+    errors_mm = [
+        np.percentile(distance_from_curve(g.fit.points_mm, shown.truth.centerline_mm), 95) for g in (once, found)
+    ]
+    assert errors_mm[1] < 0.1
+    assert errors_mm[0] > 0.5
 
 
 def test_further_looks_are_glances_from_where_the_one_before_ended() -> None:
-    shown, before = far_away(), steady(tracked("dark"))
-    found = glance(shown.images, RIG, before, PARAMETERS)
+    world, shown, before = swung()
+    found = glance(shown.images, world.rig, before, PARAMETERS)
     assert found is not None
     length_mm, by_hand, from_here = float(spline.arc_length(before.points_mm)[-1]), None, before
     for _ in range(found.looks):
-        by_hand = glance(shown.images, RIG, from_here, PARAMETERS, most_looks=1)
+        by_hand = glance(shown.images, world.rig, from_here, PARAMETERS, most_looks=1)
         assert by_hand is not None
         from_here = replace(before, points_mm=by_hand.fit.points_mm, length_mm=length_mm)
     assert by_hand is not None

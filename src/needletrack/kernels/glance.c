@@ -450,10 +450,11 @@ static int settled(const Call *call, int64_t most_looks) {
   lengths(now.before_mm, now.before, arc);
   double most = now.most_advance_mm, advance = now.advance_mm < -most ? -most : now.advance_mm > most ? most : now.advance_mm;
   double foreseen = arc[now.before - 1] + advance + now.foreseen_off_mm;
+  int roughly_first = now.roughly_first != 0;
   for (int64_t look = 1;; look++) {
     size_t mark = taken();
     int is_last = look == most_looks, answer = FOUND;
-    if (look == 1 ? now.roughly_first : o->elsewhere_mm > 0) {
+    if (look == 1 ? roughly_first : o->elsewhere_mm > 0) {
       double *rough = TAKE(double, 3 * o->room);
       int64_t count;
       if (!rough) return NO_MEMORY;
@@ -469,6 +470,11 @@ static int settled(const Call *call, int64_t most_looks) {
     if (answer != NO_MEMORY) answer = glanced(&now, call->eyes, call->views, is_last, o);
     if (answer == NO_MEMORY) return answer;
     give_back(mark);
+    if (answer != FOUND && look == 1 && !roughly_first) {
+      /* It did not move before, and may have moved all at once. */
+      roughly_first = 1, look = 0;
+      continue;
+    }
     if (answer != FOUND && look > 1) {
       /* What another look does not see is known as well as it was before. */
       give_back(before_any);

@@ -274,13 +274,14 @@ def glanced(
     previous: NeedleTrack,
     since_s: float,
     first_mm: Float | None = None,
+    is_astray: bool = False,
     most_looks: int = MOST_LOOKS,
 ) -> Glanced | None:
     """The needle where it has moved since the pair before, looked at there: a hundredth of what `refine` takes.
 
     What it looks like and where its base is are known. None where a glance does not do: its tip was never seen, or it
-    is so bright that it is white. first_mm: the curve (N, 3) to the tip at which a first glance put it already;
-    most_looks: how often it is looked at.
+    is so bright that it is white. first_mm: the curve (N, 3) to the tip at which a first glance put it already, and
+    is_astray: whether it is not there; most_looks: how often it is looked at.
     Raises NeedleNotFound where the views do not show it.
     """
     steady = _steady(previous, since_s, models)
@@ -289,7 +290,7 @@ def glanced(
     if first_mm is not None:
         advance_mm = float(np.clip(steady.advance_mm, -MOST_ADVANCE_MM, MOST_ADVANCE_MM))
         length_mm = float(arc_length(steady.points_mm)[-1]) + advance_mm
-        steady = replace(steady, points_mm=first_mm, advance_mm=0.0, length_mm=length_mm, is_moving=False)
+        steady = replace(steady, points_mm=first_mm, advance_mm=0.0, length_mm=length_mm, is_moving=is_astray)
     seen = glance(
         images,
         rig,

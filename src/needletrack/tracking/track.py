@@ -140,6 +140,7 @@ def _settled(
                 previous=previous,
                 since_s=since_s,
                 first_mm=glance.refined.fit.points_mm,
+                is_astray=glance.aside_mm >= SETTLED_MM,
                 most_looks=MOST_LOOKS - looks,
             )
             if again is None:

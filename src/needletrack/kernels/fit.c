@@ -469,66 +469,6 @@ EXPORT int start_of_fit(const double *points, const double *length_mm, int64_t n
   return 0;
 }
 
-/* What is told of a fitted curve beside its points: see `shape.judged`.
-
-   u (n,): parameters of the points (n, 3); covariance (n, 3, 3) of each. sigma, bend (n,): out, the larger standard
-   deviation across the curve, mm, and its curvature, 1/mm. Returns the share of its points whose picture in the right
-   view runs within a sine of the epipolar lines; fundamental (3, 3) is for pixels without distortion. */
-EXPORT double told_of_curve(const double *control, int64_t m, const double *u, const double *points, int64_t n,
-                            const double *covariance, const Camera *left, const Camera *right,
-                            const double *fundamental, double sine, double *sigma, double *bend) {
-  int64_t first[n], along_lines = 0;
-  double mixing[2][4 * n], pixels[2][2 * n];
-  for (int order = 1; order <= 2; order++) basis(u, n, m, order, first, mixing[order - 1]);
-  for (int v = 0; v < 2; v++) {
-    const Camera *c = v ? right : left;
-    const double *r = c->rotation, *t = c->translation_mm;
-    for (int64_t i = 0; i < n; i++) {
-      const double *p = points + 3 * i;
-      double z = dot(r + 6, p, 3) + t[2], x = (dot(r, p, 3) + t[0]) / z, y = (dot(r + 3, p, 3) + t[1]) / z;
-      pixels[v][2 * i] = c->fx * x + c->skew * y + c->cx, pixels[v][2 * i + 1] = c->fy * y + c->cy;
-    }
-  }
-  for (int64_t i = 0; i < n; i++) {
-    double d[2][3] = {{0}};
-    for (int order = 0; order < 2; order++)
-      for (int a = 0; a < 4; a++)
-        for (int k = 0; k < 3; k++) d[order][k] += mixing[order][4 * i + a] * control[3 * (first[i] + a) + k];
-    double cross[3] = {d[0][1] * d[1][2] - d[0][2] * d[1][1], d[0][2] * d[1][0] - d[0][0] * d[1][2],
-                       d[0][0] * d[1][1] - d[0][1] * d[1][0]};
-    double speed = sqrt(dot(d[0], d[0], 3));
-    speed = speed > 1e-300 ? speed : 1e-300;
-    bend[i] = sqrt(dot(cross, cross, 3)) / (speed * speed * speed);
-    /* Two directions across: the axis that the tangent is least along, made perpendicular to it, and theirs. */
-    double along[3] = {d[0][0] / speed, d[0][1] / speed, d[0][2] / speed}, one[3], other[3];
-    int least = fabs(along[0]) < fabs(along[1]) ? 0 : 1;
-    least = fabs(along[2]) < fabs(along[least]) ? 2 : least;
-    for (int k = 0; k < 3; k++) one[k] = (k == least) - along[least] * along[k];
-    double length = sqrt(dot(one, one, 3));
-    for (int k = 0; k < 3; k++) one[k] /= length;
-    for (int k = 0; k < 3; k++)
-      other[k] = along[(k + 1) % 3] * one[(k + 2) % 3] - along[(k + 2) % 3] * one[(k + 1) % 3];
-    double a = 0, b = 0, c = 0;
-    for (int p = 0; p < 3; p++)
-      for (int q = 0; q < 3; q++) {
-        double value = covariance[9 * i + 3 * p + q];
-        a += one[p] * value * one[q], b += one[p] * value * other[q], c += other[p] * value * other[q];
-      }
-    double variance = (a + c) / 2 + sqrt((a - c) * (a - c) / 4 + b * b);
-    sigma[i] = sqrt(variance > 1e-12 ? variance : 1e-12);
-    const double *l = pixels[0] + 2 * i, *before = pixels[1] + 2 * (i > 0 ? i - 1 : 0),
-                 *after = pixels[1] + 2 * (i + 1 < n ? i + 1 : n - 1);
-    double line[2], run[2] = {after[0] - before[0], after[1] - before[1]};
-    for (int k = 0; k < 2; k++)
-      line[k] = fundamental[3 * k] * l[0] + fundamental[3 * k + 1] * l[1] + fundamental[3 * k + 2];
-    /* The line's normal by the tangent: the sine of the angle between them. */
-    double off = fabs(line[0] * run[0] + line[1] * run[1]) /
-                 sqrt((line[0] * line[0] + line[1] * line[1]) * (run[0] * run[0] + run[1] * run[1]) + 1e-300);
-    along_lines += off < sine;
-  }
-  return (double)along_lines / (double)n;
-}
-
 /* Values of the four basis functions (n, 4) of a clamped cubic B-spline of m control points on [0, 1] that are not 0 at
    u (n,), or their derivative of that order, and which the first is (de Boor 1978, algorithm A2.2 of Piegl & Tiller). */
 EXPORT void basis(const double *u, int64_t n, int64_t m, int64_t derivative, int64_t *first, double *mixing) {

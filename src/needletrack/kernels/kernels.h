@@ -128,6 +128,8 @@ static inline float log_one_plus_exp_negative(float d) {
 }
 
 /* The kernels themselves; each says beside its body what it does. */
+#define MOST_DEGREE 3
+int polynomial(const double *at, const double *values, int64_t n, int64_t d, int degree, double *terms);
 int parabola(const double *at, const double *values, int64_t n, int64_t d, double *terms);
 void project(const Camera *c, const double *points_mm, int64_t n, double *pixels);
 void straighten(const uint8_t *image, int64_t rows, int64_t columns, int64_t stride, const Camera *c,

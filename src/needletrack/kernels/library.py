@@ -27,7 +27,8 @@ def load(path: Path) -> ctypes.CDLL:
         ) from error
     # An item of a library is a new function each time; an attribute is kept.
     library.streak_misfit.restype = ctypes.c_double
-    library.told_of_curve.restype = ctypes.c_double
+    for kernel in (library.told_of_curve, library.covariance_of_tip, library.off_epipolar_px):
+        kernel.restype = ctypes.c_double
     library.tip_picture.restype = ctypes.c_double
     library.find_streak.restype = ctypes.c_int64
     return library
@@ -48,12 +49,17 @@ def address(array: Array) -> int:
     return int(array.__array_interface__["data"][0])
 
 
-def call(name: str, *arguments: Array | float | int | ctypes.Structure | ctypes.Array[Any]) -> Any:
-    """What the kernel of that name returns; arrays are handed over as pointers, whole numbers as int64."""
+def call(name: str, *arguments: Array | float | int | ctypes.Structure | ctypes.Array[Any] | None) -> Any:
+    """What the kernel of that name returns; arrays are handed over as pointers, whole numbers as int64.
+
+    None is a null pointer.
+    """
     passed: list[Any] = []
     for argument in arguments:
         if isinstance(argument, np.ndarray):
             passed.append(ctypes.c_void_p(address(argument)))
+        elif argument is None:
+            passed.append(None)
         elif isinstance(argument, float):
             passed.append(ctypes.c_double(argument))
         elif isinstance(argument, int):

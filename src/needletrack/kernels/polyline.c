@@ -52,32 +52,38 @@ EXPORT void distances_from(const double *points, int64_t count, const double *li
   }
 }
 
-/* The terms (3, d), constant first, of the parabolas that are nearest to values (n, d) at places (n,). Returns 1 where
-   the places hold no parabola. */
-EXPORT int parabola(const double *at, const double *values, int64_t n, int64_t d, double *terms) {
-  enum { TERMS = 3 };
-  double normal[TERMS][TERMS] = {{0}}, whole[TERMS];
-  memset(terms, 0, (size_t)(TERMS * d) * sizeof *terms);
+/* The terms (degree + 1, d), constant first, of the polynomials that are nearest to values (n, d) at places (n,), of a
+   degree of MOST_DEGREE at most. Returns 1 where the places hold none. */
+int polynomial(const double *at, const double *values, int64_t n, int64_t d, int degree, double *terms) {
+  double normal[MOST_DEGREE + 1][MOST_DEGREE + 1] = {{0}}, whole[MOST_DEGREE + 1];
+  int count = degree + 1;
+  memset(terms, 0, (size_t)(count * d) * sizeof *terms);
   for (int64_t i = 0; i < n; i++) {
-    double power[TERMS] = {1, at[i], at[i] * at[i]};
-    for (int a = 0; a < TERMS; a++) {
-      for (int b = 0; b < TERMS; b++) normal[a][b] += power[a] * power[b];
+    double power[MOST_DEGREE + 1] = {1};
+    for (int a = 1; a < count; a++) power[a] = power[a - 1] * at[i];
+    for (int a = 0; a < count; a++) {
+      for (int b = 0; b < count; b++) normal[a][b] += power[a] * power[b];
       for (int64_t k = 0; k < d; k++) terms[a * d + k] += power[a] * values[i * d + k];
     }
   }
-  for (int a = 0; a < TERMS; a++) whole[a] = normal[a][a];
+  for (int a = 0; a < count; a++) whole[a] = normal[a][a];
   /* Gauss and Jordan; the matrix is positive definite, so that no pivot need be looked for. */
-  for (int a = 0; a < TERMS; a++) {
+  for (int a = 0; a < count; a++) {
     double pivot = normal[a][a];
     if (!(pivot > 1e-13 * whole[a])) return 1;
-    for (int b = 0; b < TERMS; b++) normal[a][b] /= pivot;
+    for (int b = 0; b < count; b++) normal[a][b] /= pivot;
     for (int64_t k = 0; k < d; k++) terms[a * d + k] /= pivot;
-    for (int other = 0; other < TERMS; other++) {
+    for (int other = 0; other < count; other++) {
       double share = normal[other][a];
       if (other == a) continue;
-      for (int b = 0; b < TERMS; b++) normal[other][b] -= share * normal[a][b];
+      for (int b = 0; b < count; b++) normal[other][b] -= share * normal[a][b];
       for (int64_t k = 0; k < d; k++) terms[other * d + k] -= share * terms[a * d + k];
     }
   }
   return 0;
+}
+
+/* The terms (3, d) of the parabolas that are nearest: see `polynomial`. */
+EXPORT int parabola(const double *at, const double *values, int64_t n, int64_t d, double *terms) {
+  return polynomial(at, values, n, d, 2, terms);
 }

@@ -95,7 +95,7 @@ def weaknesses(
         Reason.HIGH_RESIDUAL: refined.fit.rms_px > parameters.max_reprojection_rms_px
         or refined.fit.streak_misfit > parameters.max_streak_misfit,
         Reason.HIGH_UNCERTAINTY: _percentile_95(curve.sigma_mm) > parameters.max_sigma_mm
-        or float(np.sqrt(np.linalg.eigvalsh(refined.tip_covariance_mm2)[-1])) > parameters.max_sigma_mm,
+        or refined.tip_sigma_mm > parameters.max_sigma_mm,
         Reason.TIP_NOT_SEEN: min(tip.contrast) < parameters.min_tip_contrast
         or not refined.tip_is_free
         or _seen_before_tip(curve) < parameters.min_tip_seen_share,

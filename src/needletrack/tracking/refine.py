@@ -15,6 +15,7 @@ from needletrack.geometry.camera import Camera
 from needletrack.geometry.spline import arc_length, cut, resample, spline_basis, unit
 from needletrack.geometry.stereo import StereoRig
 from needletrack.geometry.transform import RigidTransform
+from needletrack.kernels import call
 from needletrack.records import Appearance, Float, NeedleTrack, Reason
 from needletrack.tracking.adjust import MOVED, SETTLED, Adjusted, Images, adjust
 from needletrack.tracking.beside import Beside, BesideParameters, line_height_gray, look_beside, sides_gray
@@ -134,17 +135,27 @@ class Refined:
     log_odds: float
     calibration_mm2: Float | None = None
 
-    @cached_property
+    @property
     def tip_covariance_mm2(self) -> Float:
         """Covariance (3, 3) of the tip: across the needle that of the curve, along it that of the end's picture."""
+        return self._of_tip[0]
+
+    @property
+    def tip_sigma_mm(self) -> float:
+        """The tip's largest standard deviation in any direction, mm."""
+        return self._of_tip[1]
+
+    @cached_property
+    def _of_tip(self) -> tuple[Float, float]:
         at_tip = spline_basis(self.fit.parameters[-1:], len(self.fit.control_mm), derivative=1)
         along = unit(at_tip.curve(self.fit.control_mm)[0])
         (left, right), (left_sigma, right_sigma) = self.tip.each_mm, self.tip.sigma_mm
         along_mm2 = 1 / (left_sigma**-2 + right_sigma**-2) + ((left - right) / 2) ** 2
-        covariance = self.fit.point_covariance_mm2[-1] + along_mm2 * np.outer(along, along)
-        if self.calibration_mm2 is not None:
-            covariance = covariance + self.calibration_mm2[-1]
-        return np.asarray((covariance + covariance.T) / 2)
+        covariance_mm2 = np.empty((3, 3))
+        of_calibration = None if self.calibration_mm2 is None else np.ascontiguousarray(self.calibration_mm2[-1])
+        across = self.fit.point_covariance_mm2[-1]
+        sigma_mm = call("covariance_of_tip", across, of_calibration, along, along_mm2, covariance_mm2)
+        return covariance_mm2, float(sigma_mm)
 
 
 @dataclass(frozen=True, slots=True)

@@ -5,8 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from needletrack.geometry.epipolar import sampson_distance_px
-from needletrack.geometry.spline import arc_length, parabola, spline_basis, unit
+from needletrack.geometry.spline import arc_length
 from needletrack.geometry.stereo import StereoRig
 from needletrack.geometry.transform import orientation_along
 from needletrack.kernels import call
@@ -28,8 +27,9 @@ from needletrack.tracking.parameters import TrackingParameters
 from needletrack.tracking.refine import Refined
 
 _SAME_SHAPE_MM = 2.0
-# The tip's direction is taken over this much of the needle, mm before the apex.
-_DIRECTION_MM, _DIRECTION_SKIP_MM, _LEAST_DIRECTION_MM, _PARABOLA_RAD = 19.0, 3.0, 6.0, 0.5
+# The tip's direction: the stretch over which the bend is told and what is left out before the apex, mm; and the longest
+# and the least stretch of a parabola, mm, which follows a needle's turn over so many radians; and of a cubic.
+_DIRECTION_RULES = np.array([19.0, 3.0, *(16.0, 6.0, 0.5), *(40.0, 12.0, 0.8)])
 _MAX_VELOCITY_INTERVAL_NS = 250_000_000
 
 
@@ -37,11 +37,13 @@ _MAX_VELOCITY_INTERVAL_NS = 250_000_000
 class Shape:
     """A shape and why it is not ok (empty where it is).
 
-    doubts: those of the reasons that only a search of the whole images can find, or lift.
+    doubts: those of the reasons that only a search of the whole images can find, or lift. out_of_base (3,): the unit
+    direction in which it leaves its base.
     """
 
     refined: Refined
     curve: NeedleCurve
+    out_of_base: Float
     quality: Quality
     reasons: tuple[Reason, ...]
     doubts: tuple[Reason, ...] = ()
@@ -49,6 +51,8 @@ class Shape:
     def doubted(self, doubts: Iterable[Reason]) -> "Shape":
         """The same shape with reasons that only a search of the whole images can find, or lift."""
         both = {*self.doubts, *doubts}
+        if not both:
+            return self
         reasons = tuple(reason for reason in Reason if reason in both or reason in self.reasons)
         return replace(self, reasons=reasons, doubts=tuple(reason for reason in Reason if reason in both))
 
@@ -63,20 +67,21 @@ def judged(refined: Refined, rig: StereoRig, parameters: TrackingParameters, pre
     fit = refined.fit
     seen = refined.shown
     # One error for all points of all pairs: it does not average out along the needle.
-    refined = replace(refined, calibration_mm2=rig.calibration_covariance_mm2(fit.points_mm))
+    of_calibration = rig.calibration_covariance_mm2(fit.points_mm)
+    if of_calibration is not None:
+        refined = replace(refined, calibration_mm2=of_calibration)
     covariance_mm2 = fit.point_covariance_mm2
     if refined.calibration_mm2 is not None:
         covariance_mm2 = covariance_mm2 + refined.calibration_mm2
-    sigma_mm, curvature_per_mm, along_epipolar_lines = told_of_curve(
+    sigma_mm, curvature_per_mm, ends, along_epipolar_lines = told_of_curve(
         fit, covariance_mm2, rig, parameters.gates.epipolar_angle_deg
     )
     length_mm = float(arc_length(fit.points_mm)[-1])
     curve = NeedleCurve(fit.points_mm, sigma_mm, seen.sum(axis=0), curvature_per_mm, length_mm)
-    left_px = rig.left.undistort(refined.tip_px[[0]])
-    right_px = rig.right.undistort(refined.tip_px[[1]])
+    off_px = call("off_epipolar_px", *rig.lenses, rig.fundamental, np.ascontiguousarray(refined.tip_px))
     quality = Quality(
         fit.rms_px,
-        float(sampson_distance_px(rig.fundamental, left_px, right_px)[0]),
+        float(off_px),
         float(seen.all(axis=0).mean()),
     )
     reasons = weaknesses(
@@ -89,18 +94,19 @@ def judged(refined: Refined, rig: StereoRig, parameters: TrackingParameters, pre
         previous,
         along_epipolar_lines=along_epipolar_lines,
     )
-    return Shape(refined, curve, quality, reasons)
+    return Shape(refined, curve, ends[0], quality, reasons)
 
 
 def told_of_curve(
     fit: CurveFit, covariance_mm2: Float, rig: StereoRig, epipolar_angle_deg: float
-) -> tuple[Float, Float, float]:
+) -> tuple[Float, Float, Float, float]:
     """The larger sigma (N,) across a curve, mm, of points of covariance (N, 3, 3); its curvature (N,), 1/mm.
 
-    And the share of its points whose picture in the right view runs within an angle of the epipolar lines.
+    And unit directions (2, 3) at both its ends, and the share of its points whose picture in the right view runs within
+    an angle of the epipolar lines.
     """
     count = len(fit.points_mm)
-    sigma_mm, curvature_per_mm = np.empty((2, count))
+    sigma_mm, curvature_per_mm, ends = np.empty(count), np.empty(count), np.empty((2, 3))
     share = call(
         "told_of_curve",
         np.ascontiguousarray(fit.control_mm),
@@ -114,8 +120,9 @@ def told_of_curve(
         float(np.sin(np.radians(epipolar_angle_deg))),
         sigma_mm,
         curvature_per_mm,
+        ends,
     )
-    return sigma_mm, curvature_per_mm, share
+    return sigma_mm, curvature_per_mm, ends, float(share)
 
 
 def differ(curve: NeedleCurve, other: NeedleCurve) -> bool:
@@ -134,16 +141,15 @@ def as_track(
 ) -> NeedleTrack:
     """The track to publish: without a tip where the free end was not found, for a curve's end is not yet a tip."""
     fit, points_mm = shape.refined.fit, shape.curve.points_mm
-    at_base = spline_basis(fit.parameters[:1], len(fit.control_mm), derivative=1)
-    along = np.stack([unit(at_base.curve(fit.control_mm)[0]), _tip_direction(shape.curve)])
     curve, tip, since_s = shape.curve, None, _since_s(captured_at_ns, previous)
     if since_s is not None and previous is not None and previous.curve is not None:
         curve = replace(curve, velocity_mm_s=moved_aside_mm(points_mm, previous.curve.points_mm) / since_s)
     if Reason.TIP_NOT_SEEN not in shape.reasons:
+        out_of_tip = _tip_direction(shape.curve)
         tip = TipPose(
             points_mm[-1],
-            along[1],
-            orientation_along(along[1]),
+            out_of_tip,
+            orientation_along(out_of_tip),
             shape.refined.tip_covariance_mm2,
             None
             if since_s is None or previous is None or previous.tip is None
@@ -156,7 +162,7 @@ def as_track(
         shape.reasons,
         curve,
         tip,
-        BasePose(points_mm[0], along[0]),
+        BasePose(points_mm[0], shape.out_of_base),
         shape.refined.diameter_mm,
         shape.refined.appearance,
         since_detection,
@@ -168,21 +174,14 @@ def as_track(
 
 
 def _tip_direction(curve: NeedleCurve) -> Float:
-    """Unit direction (3,) out of the tip: of a parabola through the last stretch, the tip's own taper left out.
+    """Unit direction (3,) out of the tip, between that of a parabola and of a longer cubic, the tip's taper left out.
 
-    What shows there is thin and faint: the spline's own end is twice as far off.
+    What shows there is thin and faint: the spline's own end is twice as far off. A parabola errs where the bend
+    changes, a cubic more by noise, and both apart from one another.
     """
-    points_mm = curve.points_mm
-    arc = arc_length(points_mm)
-    before = arc - arc[-1]
-    # A parabola follows a needle's turn over about half a radian.
-    bend = float(np.median(curve.curvature_per_mm[np.searchsorted(before, -_DIRECTION_MM) :]))
-    length_mm = min(_DIRECTION_MM - _DIRECTION_SKIP_MM, max(_LEAST_DIRECTION_MM, _PARABOLA_RAD / max(bend, 1e-6)))
-    first = int(np.searchsorted(before, -_DIRECTION_SKIP_MM - length_mm))
-    stop = int(np.searchsorted(before, -_DIRECTION_SKIP_MM, side="right"))
-    if stop - first < 5:
-        return unit(points_mm[-1] - points_mm[-2])
-    return unit(parabola(before[first:stop], points_mm[first:stop])[1])
+    direction = np.empty(3)
+    call("direction_of_tip", curve.points_mm, len(curve.points_mm), curve.curvature_per_mm, _DIRECTION_RULES, direction)
+    return direction
 
 
 def _since_s(captured_at_ns: int, previous: NeedleTrack | None) -> float | None:

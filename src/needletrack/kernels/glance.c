@@ -280,8 +280,9 @@ static int roughly(const Glance *g, const Eye *eyes, int64_t room, int64_t *coun
   Fitting fitting;
   int failed = course(g, g->rough_section_mm, room, &c);
   if (!failed) failed = told_of(g, &g->rough, eyes, &c, told);
-  double *moved = TAKE(double, 3 * c.n), *arc = TAKE(double, c.n);
-  if (failed || !arc) return failed ? failed : NO_MEMORY;
+  if (failed) return failed;
+  double *moved = TAKE(double, 3 * c.n);
+  if (!moved) return NO_MEMORY;
   failed = begin_fitting(&g->rough, &g->spline, eyes, told, c.points, c.arc, c.n, g->since_s, &fitting);
   if (!failed) failed = settle(&g->rough, &g->spline, eyes, told, &fitting, moved);
   if (failed) return failed;
@@ -306,6 +307,7 @@ static int glanced(const Glance *g, const Eye *eyes, TipView *views, int is_last
   const int64_t n = c.n, curve_count = c.before_its_tip;
   const double *points = c.points, *arc = c.arc;
   double *local = TAKE(double, 3 * n), *px = TAKE(double, 2 * n);
+  if (!px) return NO_MEMORY;
 
   /* One spline for both. */
   Fitting fitting;
